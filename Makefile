@@ -1,5 +1,5 @@
 # Two commands are enough: `make demo` shows the toolkit at work, `make test` checks it. Both set up what they need.
-.PHONY: demo test test-py312 env lint types bench format clean
+.PHONY: demo test test-py312 env lint types bench pictures format clean
 OUT ?= out
 RUN = .venv/bin/python -m
 JOBS ?= 2
@@ -31,9 +31,15 @@ format: env
 	@$(RUN) ruff format .
 	@$(RUN) ruff check --fix .
 
-# Every figure in docs/benchmarks comes from this.
+# Every page in docs/benchmarks comes from this (a quiet machine, 15 minutes).
 bench: env
-	for stage in refraction warp calibration; do .venv/bin/rainstereo bench $$stage --out $(OUT)/bench; done
+	.venv/bin/rainstereo bench all --out $(OUT)/bench --docs docs/benchmarks
+
+# Every picture of the tutorial and the README comes from this.
+pictures: env
+	.venv/bin/rainstereo demo --out $(OUT)/demo --pictures $(OUT)/pictures
+	for name in $$(grep -oh 'images/[a-z0-9/.-]*' README.md docs/tutorial.md | sort -u); do \
+	  mkdir -p "docs/$$(dirname $$name)" && cp "$(OUT)/pictures/$${name#images/}" "docs/$$name"; done
 
 clean:
 	rm -rf .venv .venv312 $(OUT) build dist *.egg-info

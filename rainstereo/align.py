@@ -118,8 +118,8 @@ def residual_shift(dry: Image, wet: Image, tile: int = 96) -> tuple[Array, Array
     alone is off by 0.2 px. A difference in brightness or contrast between the cameras does not matter.
 
     Returns tile centres (N, 2) pixels, shifts (N, 2) pixels (wet minus dry; NaN where nothing correlates), and the
-    correlation coefficient (N,), which tells how far a tile can be trusted: low where drops, occlusion or a lack of
-    texture spoil it.
+    shifts' standard deviations (N,) pixels in the worst direction, inf without an answer: large where drops,
+    occlusion or a lack of texture leave little to go by.
     """
     if dry.shape != wet.shape:
         raise ValueError(f"an aligned pair has one size; these images have {dry.shape} and {wet.shape}")
@@ -127,17 +127,39 @@ def residual_shift(dry: Image, wet: Image, tile: int = 96) -> tuple[Array, Array
     tile = min(tile, *gray[0].shape)
     corners = [(x, y) for y in range(0, gray[0].shape[0] - tile + 1, tile)
                for x in range(0, gray[0].shape[1] - tile + 1, tile)]  # fmt: skip
-    window = cv2.createHanningWindow((tile, tile), cv2.CV_64F)
+    window = cv2.createHanningWindow((tile, tile), cv2.CV_32F)
     centres = np.array(corners) + (tile - 1) / 2
-    shifts, correlations = np.full((len(corners), 2), np.nan), np.zeros(len(corners))
+    shifts, sigmas = np.full((len(corners), 2), np.nan), np.full(len(corners), np.inf)
     for i, (x, y) in enumerate(corners):
         a, b = (image[y : y + tile, x : x + tile].astype(np.float32) for image in gray)
-        start, _ = cv2.phaseCorrelate(a - a.mean(dtype=float), b - b.mean(dtype=float), window.astype(np.float32))
+        start, _ = cv2.phaseCorrelate(a - float(a.mean()), b - float(b.mean()), window)
         motion = np.array([[1, 0, start[0]], [0, 1, start[1]]], dtype=np.float32)
         try:
             stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-4)
-            correlations[i], found = cv2.findTransformECC(a, b, motion, cv2.MOTION_TRANSLATION, stop)
+            _, found = cv2.findTransformECC(a, b, motion, cv2.MOTION_TRANSLATION, stop)
         except cv2.error:  # flat or unrelated content: OpenCV says so by an exception
             continue
         shifts[i] = np.asarray(found)[:, 2]
-    return centres, shifts, correlations
+        sigmas[i] = _shift_sigma(a, b, np.asarray(found))
+    return centres, shifts, sigmas
+
+
+def _shift_sigma(a: Image, b: Image, motion: Array) -> float:
+    """Standard deviation of a tile's shift: what differs after alignment, against the texture that both share.
+
+    The texture is the structure tensor of one image's gradients with the other's, in which noise averages out. The
+    smoothing makes 4 pi s^2 = 15 neighbouring pixels (s = 1.1 px) count as one.
+    """
+    size = a.shape[::-1]
+    both = a, cv2.warpAffine(b, motion, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    margin = int(np.abs(motion[:, 2]).max()) + 3  # beyond it the shifted tile is empty
+    if 2 * margin >= min(size) - 8:
+        return float("inf")
+    a, b = (cv2.GaussianBlur(image, (5, 5), 0)[margin:-margin, margin:-margin] for image in both)
+    a, b = a - a.mean(), b - b.mean()
+    left = float((a * a).mean() - (a * b).mean() ** 2 / max(float((b * b).mean()), 1e-9))
+    dx, dy = ([np.gradient(image, axis=axis) for image in (a, b)] for axis in (1, 0))
+    xx, yy = float((dx[0] * dx[1]).sum()), float((dy[0] * dy[1]).sum())
+    xy = float((dx[0] * dy[1] + dy[0] * dx[1]).sum()) / 2
+    weakest = (xx + yy) / 2 - float(np.hypot((xx - yy) / 2, xy))
+    return float(np.sqrt(15 * max(left, 1e-6) / weakest)) if weakest > 0 else float("inf")

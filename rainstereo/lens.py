@@ -79,7 +79,8 @@ def fold_radius(k: Array) -> float:
     Beyond it a lens model folds the image back onto itself (or passes a pole), and points there have no answer.
     Tangential and prism terms are left out: they are small against the radial ones wherever a lens is usable.
     """
-    k1, k2, _, _, k3, k4, k5, k6, *_ = _padded(k)
+    # a coefficient that cannot matter at any radius of use would only overflow the root finder
+    k1, k2, _, _, k3, k4, k5, k6, *_ = (c if abs(c) > 1e-30 else 0.0 for c in _padded(k))
     N, D = np.poly1d([k3, k2, k1, 1.0]), np.poly1d([k6, k5, k4, 1.0])
     s = np.poly1d([1.0, 0.0])  # r^2
     growth = (N + 2 * s * N.deriv()) * D - 2 * s * N * D.deriv()  # d(r N/D)/dr times D^2

@@ -217,6 +217,7 @@ def _thicknesses(zn: Array, chamber: Chamber) -> dict[float, Any]:
 
 
 def _newton(zn: Array, r2: Array, layers: list[tuple[Array, Any]]) -> tuple[Array, types.Mask]:
+    """delta, and where the iteration has converged."""
     real = zn.dtype.type
     delta = np.zeros_like(zn)
     for thickness, n in layers:
@@ -225,7 +226,9 @@ def _newton(zn: Array, r2: Array, layers: list[tuple[Array, Any]]) -> tuple[Arra
         return delta, np.ones(len(zn), dtype=np.bool_)
     n2 = [n * n for _, n in layers]
     bend = [(q - 1) * r2 for q in n2]
-    tolerance = real(max(1e-9, 8 * float(np.finfo(real).eps)))  # the error after a step is about its square
+    eps = float(np.finfo(real).eps)
+    # |T phi''| w^2 / 2 <= 0.3 T / n, so a step s leaves a relative error of 0.3 (sum T / n) s^2 / (w^3 slope) at most
+    curvature = 0.3 * sum(float(np.max(thickness, initial=0)) / float(n) for thickness, n in layers)
     for _ in range(ITERATIONS):
         w = zn - delta
         value, slope = delta.copy(), np.ones_like(zn)
@@ -235,7 +238,10 @@ def _newton(zn: Array, r2: Array, layers: list[tuple[Array, Any]]) -> tuple[Arra
             slope -= thickness * (c * inverse * (inverse * inverse))
         step = value / slope
         delta -= step
-        small = np.abs(step) <= tolerance * w
+        largest = max(float(step.max(initial=0)), -float(step.min(initial=0)))
+        if curvature * largest**2 <= 0.5 * eps * float(w.min(initial=1)) ** 3 * float(slope.min(initial=1)):
+            return delta, np.ones(len(zn), dtype=np.bool_)
+        small = np.abs(step) <= 8 * eps * w
         if small.all():
             break
     return delta, small

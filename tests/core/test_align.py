@@ -174,16 +174,34 @@ def test_largest_rectangle_never_holds_an_invalid_pixel(rng: np.random.Generator
 def test_residual_shift_finds_a_sub_pixel_shift(shift: tuple[float, float], rng: np.random.Generator) -> None:
     texture = gaussian_filter(rng.random((288, 384)), 1.5, mode="wrap")
     moved = np.fft.ifft2(fourier_shift(np.fft.fft2(texture), shift[::-1])).real
-    scale = 255 / texture.max()
-    _, shifts, responses = residual_shift(
-        (texture * scale).astype(np.uint8), np.clip(moved * scale, 0, 255).astype(np.uint8)
-    )
+    a, b = ((image * 255 / texture.max()).clip(0, 255).astype(np.uint8) for image in (texture, moved))
+    _, shifts, sigmas = residual_shift(a, b)
     assert len(shifts) == 12
     np.testing.assert_allclose(np.median(shifts, axis=0), shift, atol=0.03)
-    assert responses.min() > 0.5
-    noise = rng.integers(0, 255, texture.shape, dtype=np.uint8)
-    assert np.median(residual_shift((texture * scale).astype(np.uint8), noise)[2]) < 0.2
-    flat = np.full_like(noise, 90)
-    assert np.isnan(residual_shift(flat, noise)[1]).all()
+    assert sigmas.max() < 0.1
+    brighter = np.clip(b * 0.6 + 30, 0, 255).astype(np.uint8)
+    np.testing.assert_allclose(np.median(residual_shift(a, brighter)[1], axis=0), shift, atol=0.05)
+
+
+def test_residual_shift_knows_what_it_does_not_know(rng: np.random.Generator) -> None:
+    """Noise on noise, flat walls and smooth skies have no shift that means anything."""
+    noise = rng.integers(0, 255, (288, 384), dtype=np.uint8)
+    other = rng.integers(0, 255, (288, 384), dtype=np.uint8)
+    assert (residual_shift(noise, other)[2] > 0.3).all()
+    _, shifts, sigmas = residual_shift(np.full_like(noise, 90), noise)
+    assert np.isnan(shifts).all()
+    assert np.isinf(sigmas).all()
+    sky = np.linspace(120, 170, 288)[:, None] + np.zeros(384)
+    a, b = (np.clip(sky + rng.normal(size=sky.shape), 0, 255).astype(np.uint8) for _ in range(2))
+    assert (residual_shift(a, b)[2] > 0.1).all()
     with pytest.raises(ValueError, match="one size"):
         residual_shift(noise, noise[:-1])
+
+
+def test_the_sigma_of_a_shift_is_honest(rng: np.random.Generator) -> None:
+    """Over many noisy tiles the error is what the sigma says, within a factor of two."""
+    texture = 120 + 400 * gaussian_filter(rng.normal(size=(768, 768)), 4, mode="wrap")
+    a, b = (np.clip(texture + rng.normal(scale=6, size=texture.shape), 0, 255).astype(np.uint8) for _ in range(2))
+    _, shifts, sigmas = residual_shift(a, b)
+    ratio = np.sqrt(np.mean(shifts**2)) / np.median(sigmas)
+    assert 0.4 < ratio < 2

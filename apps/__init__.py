@@ -1,0 +1,1 @@
+"""The `rainstereo` command: one module per subcommand, reports, benchmarks."""

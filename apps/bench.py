@@ -1,0 +1,119 @@
+"""`rainstereo bench`: time and error of each way to do the same work, as numbers, pictures and words."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from rainstereo.apps import bench_page
+from rainstereo.apps.bench_harness import SINGLE_THREAD, Outcome, Stage, machine, measure, steps
+from rainstereo.apps.record import Record, write_atomically
+
+STAGES: dict[str, str] = {
+    "refraction": "rainstereo.apps.bench_refraction",
+    "warp": "rainstereo.apps.bench_warp",
+    "calibration": "rainstereo.apps.bench_calibration",
+}
+"""Stage -> module with `build(seed, quick) -> Stage`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure every way to do the same work: run time beside error, interleaved repeats, median and spread.
+
+    Stages: refraction, warp, calibration, or all. For each it writes OUT/STAGE/report.json (all samples),
+    report.html, a Markdown table and a plot of error against time; OUT/report.json sums up.
+    """
+
+    stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
+    """What to measure: refraction, warp, calibration, or all."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
+    """Folder for the results."""
+    repeats: int = 15
+    """Rounds in which every variant runs once (slow ones run in fewer)."""
+    seed: int = 0
+    """Seed of everything that is drawn at random."""
+    quick: bool = False
+    """Little work and at most 3 rounds: does it run, rather than how fast."""
+    docs: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Also write STAGE.md and its pictures into this folder, as in docs/benchmarks."""
+
+
+def run(options: Options) -> int:
+    """Run the stages that are asked for. Returns 0, whether or not targets are met: figures are no failure."""
+    names = list(STAGES) if options.stage == "all" else [options.stage]
+    for name in names:
+        if name not in STAGES:
+            raise ValueError(f"there is no stage {name!r}; expected one of {', '.join(STAGES)}, or all")
+    if options.repeats < 1:
+        raise ValueError(f"--repeats is {options.repeats}; expected 1 or more")
+    if any(os.environ.get(name) != value for name, value in SINGLE_THREAD.items()):
+        return _run_on_one_thread(options)
+    record = Record("bench", options)
+    summary = {name: _run_stage(name, options) for name in names}
+    record["stages"] = summary
+    record["machine"] = machine()
+    record.write(options.out / "report.json")
+    return 0
+
+
+def command(options: Options, stage: str) -> str:
+    """The command line that repeats a stage."""
+    return shlex.join(["rainstereo", *_arguments(options, stage)])
+
+
+def _arguments(options: Options, stage: str) -> list[str]:
+    words = ["bench", stage, "--repeats", str(options.repeats), "--seed", str(options.seed)]
+    words += ["--quick"] if options.quick else []
+    words += ["--out", str(options.out)]
+    return words if options.docs is None else [*words, "--docs", str(options.docs)]
+
+
+def _run_on_one_thread(options: Options) -> int:
+    """Numerical libraries read their thread settings when they are loaded, so the work goes to a fresh process."""
+    arguments = [sys.executable, "-m", "rainstereo.apps.cli", *_arguments(options, options.stage)]
+    return subprocess.run(arguments, env={**os.environ, **SINGLE_THREAD}, check=False).returncode
+
+
+def _run_stage(name: str, options: Options) -> dict[str, object]:
+    record = Record("bench", options)
+    before = machine()
+    stage: Stage = importlib.import_module(STAGES[name]).build(options.seed, options.quick)
+    outcomes = _measure_all(stage, min(options.repeats, 3) if options.quick else options.repeats)
+    for key, value in bench_page.figures(stage, outcomes, before).items():
+        record[key] = value
+    folder = options.out / name
+    record.write(folder / "report.json")
+    bench_page.page(stage, outcomes, before, record).write(folder / "report.html")
+    text = bench_page.markdown(stage, outcomes, before, command(options, name))
+    for place, file in ((folder, f"{name}.md"), (options.docs, f"{name}.md")):
+        if place is not None:
+            bench_page.write_pictures(stage, outcomes, place)
+            write_atomically(place / file, text.encode())
+    promises = list(bench_page.judged(outcomes))
+    for outcome in outcomes:
+        print(bench_page.plain_table(outcome), end="\n\n")
+    for _, target, measured, met in promises:
+        print(f"{'met   ' if met else 'MISSED'}  {target.words}: {bench_page.short_words(target, measured)}")
+    print(f"see {folder / 'report.html'}")
+    return {"targets": len(promises), "met": sum(met for *_, met in promises), "elapsed_s": round(record.elapsed, 1)}
+
+
+def _measure_all(stage: Stage, repeats: int) -> tuple[Outcome, ...]:
+    columns = (TextColumn("{task.description}"), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(stage.title, total=sum(steps(work, repeats) for work in stage.works))
+        return tuple(
+            measure(work, repeats, lambda words: progress.update(task, advance=1, description=words))
+            for work in stage.works
+        )

@@ -1,0 +1,187 @@
+"""`rainstereo calibrate`: board images of both cameras in, a rig folder and a verdict out."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rainstereo import Chamber
+from rainstereo.apps.calibration_page import Findings, page
+from rainstereo.apps.cli import DONE, FAILED
+from rainstereo.apps.record import Record
+from rainstereo.calib import checks, uncertainty
+from rainstereo.calib.board import Board
+from rainstereo.calib.cross_validation import choose_lensmodel
+from rainstereo.calib.mrcal_versions import SolveError
+from rainstereo.calib.observations import Observations
+from rainstereo.calib.solve import Solution, solve
+from rainstereo.pose import invert
+from rainstereo.rig import ROLES
+
+FALLBACK = "LENSMODEL_OPENCV8"
+"""Lens model with which a failed calibration is examined."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Calibrate a rig from images of a board that both cameras see, through the chamber's panels or without them."""
+
+    dry: str
+    """Board images of the dry camera: a folder, or a quoted glob such as 'boards/left*.png'."""
+    wet: str
+    """Board images of the wet camera; files are paired by name (left01 with right01, 0007 with 0007)."""
+    board: str
+    """What is printed on the board: chessboard:9x6:25mm (inner corners, side of a square), or
+    charuco:31x16:49.33mm:38.46mm:DICT_4X4_1000 (squares, their side, side of a marker, dictionary)."""
+    out: Path
+    """Rig folder to write: dry.cameramodel, wet.cameramodel, chamber.toml, report.html, report.json."""
+    chamber: Path | None = None
+    """The panels that both cameras look through, as a chamber.toml; without it they are taken to look through air."""
+    lensmodel: str = "auto"
+    """auto: chosen by cross-validation; or LENSMODEL_OPENCV4, 5, 8, 12, or splined."""
+    expected_baseline_mm: float | None = None
+    """What the drawing says; a different result is questioned."""
+    pictures: Path | None = None
+    """Folder for each picture of the report as a file of its own."""
+    cache: Path | None = None
+    """Folder that keeps the corners of each image by content, so that a second run need not look for them again."""
+    workers: int | None = None
+    """Images searched for the board at once; one for each processor by default."""
+
+
+def run(options: Options) -> int:
+    """Calibrate; the exit status."""
+    record = Record("calibrate", options)
+    board = Board.parse(options.board)
+    chamber = None if options.chamber is None else Chamber.load(options.chamber)
+    clock = Clock()
+    with progress("looking for the board") as step:
+        observations = Observations.from_folders(
+            options.dry, options.wet, board, progress=step, workers=options.workers, cache=options.cache
+        )
+    clock("detection")
+    print(f"{len(observations)} pairs show the board ({len(observations.rejected)} files left out)")
+    choice = None
+    try:
+        if options.lensmodel == "auto":
+            choice = choose_lensmodel(observations, chamber=chamber)
+            clock("choice of lens model")
+        solution = solve(observations, choice.lensmodel if choice else options.lensmodel, chamber)
+        clock("solve")
+    except SolveError as error:
+        verdict = checks.judge_failure(observations, error, FALLBACK)
+        return _finish(options, record, Findings(observations, None, None, choice, verdict, None), clock)
+    covariance = uncertainty.covariance(solution)
+    expected = options.expected_baseline_mm
+    verdict = checks.judge(
+        observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance
+    )
+    clock("uncertainty and checks")
+    return _finish(options, record, Findings(observations, solution, covariance, choice, verdict, chamber), clock)
+
+
+class Clock:
+    """Seconds spent on each stage: call it with a stage's name when the stage is over."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def __call__(self, stage: str) -> None:
+        """Note the time since the last call under this name."""
+        now = time.perf_counter()
+        self.seconds[stage] = round(now - self._last, 3)
+        self._last = now
+
+
+@contextmanager
+def progress(words: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar; the function it yields takes what is done and what there is."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True) as bars:
+        task = bars.add_task(words, total=None)
+        yield lambda done, total: bars.update(task, completed=done, total=total)
+
+
+def _finish(options: Options, record: Record, findings: Findings, clock: Clock) -> int:
+    """Write the rig if it may be trusted, the record and the page in any case; say in words what came out."""
+    verdict, solution = findings.verdict, findings.solution
+    refused = solution is None or verdict.status == "refused"
+    folder = options.out
+    if refused and (options.out / "dry.cameramodel").exists():
+        folder = options.out / "refused"  # an earlier, good calibration stays what it is
+        shutil.rmtree(folder, ignore_errors=True)
+    if solution is not None and not refused:
+        solution.rig.save(options.out)
+    record.status = verdict.status if not refused else "refused"
+    for key, value in results(findings, clock).items():
+        record[key] = value
+    record.write(folder / "report.json")
+    report = page(findings, record)
+    report.write(folder / "report.html")
+    if options.pictures:
+        report.save_pictures(options.pictures)
+    for finding in verdict.findings:
+        where = (
+            f" [{', '.join(finding.frames[:6])}{', ...' if len(finding.frames) > 6 else ''}]" if finding.frames else ""
+        )
+        print(f"{finding.severity}: {finding.text}{where}" + (f" -> {finding.remedy}" if finding.remedy else ""))
+    if solution is not None and not refused:
+        print(summary(solution, findings))
+    print(f"{'refused, no rig written' if refused else f'rig written to {options.out}'}; see {folder / 'report.html'}")
+    return FAILED if refused else DONE
+
+
+def summary(solution: Solution, findings: Findings) -> str:
+    """The calibration in one line."""
+    sigma = uncertainty.baseline_sigma(solution, findings.covariance)
+    return (
+        f"{solution.lensmodel}: {solution.rms_px:.3f} px RMS per coordinate, "
+        f"baseline {solution.rig.baseline * 1000:.3f} +- {sigma * 1000:.3f} mm, {len(solution.names)} pairs, "
+        f"{solution.outlier_count} outliers, solved in {solution.solve_seconds:.2f} s"
+    )
+
+
+def results(findings: Findings, clock: Clock) -> dict[str, object]:
+    """What `report.json` says about a calibration."""
+    observations, solution = findings.observations, findings.solution
+    told: dict[str, object] = {
+        "frames_given": len(observations),
+        "findings": findings.verdict.findings,
+        "rejected": observations.rejected,
+        "seconds": clock.seconds,
+    }
+    if findings.choice is not None:
+        told["lens_models"] = findings.choice.table
+    if solution is None:
+        return told
+    sigmas = findings.infinity
+    wet_in_dry = invert(solution.rig.rt_wet_dry)[3:]
+    return told | {
+        "lensmodel": solution.lensmodel,
+        "rms_px": solution.rms_px,
+        "rms_px_by_role": solution.rms_by_role,
+        "baseline_m": solution.rig.baseline,
+        "baseline_sigma_m": uncertainty.baseline_sigma(solution, findings.covariance),
+        "wet_camera_in_dry_frame_m": wet_in_dry,
+        "infinity_sigma_px": {name: field.typical for name, field in sigmas.items()},
+        "infinity_expected_rms_px": {name: field.expected_rms for name, field in sigmas.items()},
+        "outliers": solution.outlier_count,
+        "corners": solution.corner_count,
+        "corners_by_role": {role: int(np.isfinite(solution.residuals[role][..., 0]).sum()) for role in ROLES},
+        "frames_used": len(solution.names),
+        "frames": solution.names,
+        "dropped": solution.dropped,
+        "reordered": solution.reordered,
+        "board_warp_m": solution.calobject_warp,
+        "refraction": solution.passes,
+        "solve_seconds": solution.solve_seconds,
+    }

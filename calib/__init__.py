@@ -1,0 +1,1 @@
+"""Calibration on mrcal: boards, corners, solves through acrylic, their uncertainty and their verdict."""

@@ -1,0 +1,250 @@
+"""Calibration boards: their description in words, their corners in metres, their picture."""
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rainstereo.types import Array
+
+Kind = Literal["chessboard", "charuco"]
+
+_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_LENGTH = re.compile(r"(?P<value>[0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*(?P<unit>[a-zA-Zµ\"']*)")
+_SHAPE = re.compile(r"(?P<columns>[0-9]{1,4})[xX×](?P<rows>[0-9]{1,4})")
+_LARGEST_SIDE = 500
+_LARGEST_TEXTURE = 400_000_000
+_EXAMPLES = "chessboard:9x6:25mm (9 x 6 inner corners) or charuco:31x16:49.33mm:38.46mm:DICT_4X4_1000 (31 x 16 squares)"
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat calibration board: a chessboard or a ChArUco board.
+
+    Attributes
+    ----------
+    kind
+        ``"chessboard"`` or ``"charuco"``.
+    columns, rows
+        Number of inner corners along x (to the right) and along y (down). A ChArUco board of W x H squares has
+        (W - 1) x (H - 1) of them.
+    square
+        Side of a square in metres.
+    marker
+        Side of a ChArUco marker in metres, else None.
+    dictionary
+        Name of OpenCV's ArUco dictionary, such as ``DICT_4X4_1000``, else None.
+
+    Notes
+    -----
+    Board frame: origin at corner [0, 0], x along the columns, y along the rows, z into the board (away from a
+    viewer who sees the print). The square up and left of corner [0, 0] is black.
+
+    A wrong argument raises ValueError that names it.
+    """
+
+    kind: Kind
+    columns: int
+    rows: int
+    square: float
+    marker: float | None = None
+    dictionary: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in {"chessboard", "charuco"}:
+            raise ValueError(f"the board is a {self.kind!r}; expected 'chessboard' or 'charuco', as in {_EXAMPLES}")
+        if not (np.isfinite(self.square) and self.square > 0):
+            raise ValueError(f"the squares measure {self.square} m; give a positive length")
+        if self.kind == "chessboard":
+            self._check_chessboard()
+        else:
+            self._check_charuco()
+
+    def _check_chessboard(self) -> None:
+        if min(self.columns, self.rows) < 3 or max(self.columns, self.rows) > _LARGEST_SIDE:
+            raise ValueError(
+                f"a chessboard of {self.columns}x{self.rows} inner corners was asked for; 3 to {_LARGEST_SIDE} a side "
+                "can be detected (count the inner corners, where four squares meet, not the squares)"
+            )
+        if self.marker is not None or self.dictionary is not None:
+            raise ValueError("a chessboard has neither markers nor a dictionary; did you mean charuco?")
+
+    def _check_charuco(self) -> None:
+        width, height = self.squares
+        if self.columns * self.rows < 6 or min(self.columns, self.rows) < 2 or max(width, height) > _LARGEST_SIDE:
+            raise ValueError(
+                f"a ChArUco board of {width}x{height} squares was asked for; at least 4x3 and at most "
+                f"{_LARGEST_SIDE}x{_LARGEST_SIDE} squares are needed (for ChArUco count the squares, not the corners)"
+            )
+        if self.marker is None or self.dictionary is None:
+            raise ValueError(f"a ChArUco board needs the marker side and the dictionary, as in {_EXAMPLES}")
+        if not 0 < self.marker < self.square:
+            raise ValueError(
+                f"the markers measure {self.marker} m in squares of {self.square} m; "
+                "give the square's side first, then the marker's, which is the smaller"
+            )
+        needed, available = width * height // 2, len(aruco_dictionary(self.dictionary).bytesList)
+        if needed > available:
+            raise ValueError(
+                f"{width}x{height} squares hold {needed} markers but {self.dictionary} has only {available}; "
+                f"name the larger dictionary that it is a part of, such as {_larger(self.dictionary)}"
+            )
+
+    @classmethod
+    def parse(cls, spec: str) -> "Board":
+        """Read a board from words: ``chessboard:WxH:SQUARE`` or ``charuco:WxH:SQUARE:MARKER:DICTIONARY``.
+
+        A chessboard's WxH counts inner corners, a ChArUco board's counts squares (as OpenCV does). Lengths carry a
+        unit: mm, cm or m. If the square's size is unknown, say ``1m``: every length is then in squares.
+        """
+        kind, *fields = (field.strip() for field in spec.split(":"))
+        expected = {"chessboard": 2, "charuco": 4}
+        if kind.lower() not in expected:
+            raise ValueError(f"the board {spec!r} starts with {kind!r}; expected {_EXAMPLES}")
+        if len(fields) != expected[kind.lower()]:
+            raise ValueError(
+                f"the board {spec!r} has {len(fields)} fields after {kind!r}, not {expected[kind.lower()]}; "
+                f"expected {_EXAMPLES}"
+            )
+        width, height = _shape(fields[0], spec)
+        square = _length(fields[1], spec)
+        if kind.lower() == "chessboard":
+            return cls("chessboard", width, height, square)
+        return cls("charuco", width - 1, height - 1, square, _length(fields[2], spec), fields[3].upper())
+
+    @property
+    def spec(self) -> str:
+        """The board in words; ``Board.parse(board.spec) == board``."""
+        width, height = self.squares if self.kind == "charuco" else (self.columns, self.rows)
+        words = f"{self.kind}:{width}x{height}:{_words(self.square)}"
+        if self.marker is None:
+            return words
+        return f"{words}:{_words(self.marker)}:{self.dictionary}"
+
+    @property
+    def squares(self) -> tuple[int, int]:
+        """Number of squares along x and y: one more than inner corners."""
+        return self.columns + 1, self.rows + 1
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Extent of all squares along x and y, in metres."""
+        return self.square * (self.columns + 1), self.square * (self.rows + 1)
+
+    @cached_property
+    def points(self) -> Array:
+        """Corners in the board frame, (rows, columns, 3) metres, z = 0; read-only."""
+        points = np.zeros((self.rows, self.columns, 3))
+        points[..., 0] = self.square * np.arange(self.columns)
+        points[..., 1] = self.square * np.arange(self.rows)[:, None]
+        points.flags.writeable = False
+        return points
+
+    def charuco(self, legacy: bool = False) -> cv2.aruco.CharucoBoard:
+        """OpenCV's own object for this ChArUco board; ``legacy`` as printed by OpenCV before 4.6 (even rows only)."""
+        if self.marker is None or self.dictionary is None:
+            raise ValueError(f"{self.spec} has no markers; expected a charuco board")
+        board = cv2.aruco.CharucoBoard(self.squares, self.square, self.marker, aruco_dictionary(self.dictionary))
+        board.setLegacyPattern(legacy)
+        return board
+
+    def texture(
+        self, pixels_per_square: int, border: float = 1.0, legacy: bool = False
+    ) -> tuple[npt.NDArray[np.uint8], Array]:
+        """Picture of the board for printing and for simulation.
+
+        Parameters
+        ----------
+        pixels_per_square
+            Texels along a square's side, at least 4. Squares begin and end exactly between texels; so do marker
+            modules if ``pixels_per_square * marker / square`` is divisible suitably, else their edge texels carry
+            the exact share of black (area sampling).
+        border
+            Width of the white quiet border in squares, rounded to whole texels.
+        legacy
+            Draw a ChArUco board as OpenCV did before 4.6.
+
+        Returns
+        -------
+        image
+            (height, width) uint8.
+        origin_xy
+            (2,) texture pixel of corner [0, 0] (integer = texel centre, so this is a half-integer); corner [r, c]
+            is at ``origin_xy + pixels_per_square * (c, r)``.
+        """
+        if pixels_per_square < 4 or int(pixels_per_square) != pixels_per_square:
+            raise ValueError(f"pixels_per_square is {pixels_per_square}; give a whole number of at least 4")
+        if not border >= 0:
+            raise ValueError(f"the border is {border} squares wide; give 0 or more")
+        n = int(pixels_per_square)
+        edge = round(border * n)
+        width, height = self.squares
+        if (width * n + 2 * edge) * (height * n + 2 * edge) > _LARGEST_TEXTURE:
+            raise ValueError(f"{n} texels a square make a picture above {_LARGEST_TEXTURE} texels; give fewer")
+        black = (np.add.outer(np.arange(height), np.arange(width)) % 2) == int(legacy and height % 2 == 0)
+        inside: npt.NDArray[np.uint8] = np.where(black, 0, 255).astype(np.uint8).repeat(n, axis=0).repeat(n, axis=1)
+        if self.marker is not None:
+            self._draw_markers(inside, n, self.marker, legacy)
+        image: npt.NDArray[np.uint8] = np.pad(inside, edge, constant_values=255)
+        return image, np.full(2, edge + n - 0.5)
+
+    def _draw_markers(self, squares: npt.NDArray[np.uint8], n: int, marker: float, legacy: bool) -> None:
+        board = self.charuco(legacy)
+        dictionary = board.getDictionary()
+        modules = int(dictionary.markerSize) + 2  # with the marker's black frame of one module
+        side = n * marker / self.square
+        edges = (n - side) / 2 + side / modules * np.arange(modules + 1)
+        # share[i, k]: how much of texel i module k covers
+        texel = np.arange(n)[:, None]
+        share = np.clip(np.minimum(texel + 1, edges[1:]) - np.maximum(texel, edges[:-1]), 0, None)
+        for identity, corners in zip(np.ravel(board.getIds()), board.getObjPoints(), strict=True):
+            bits = cv2.aruco.generateImageMarker(dictionary, int(identity), modules)
+            column, row = (np.mean(corners, axis=0)[:2] // self.square).astype(int)
+            cell = 255.0 * (1.0 - share @ (bits == 0) @ share.T)
+            squares[row * n : (row + 1) * n, column * n : (column + 1) * n] = np.round(cell)
+
+
+def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
+    """OpenCV's predefined ArUco dictionary of this name; ValueError with the known names if there is none."""
+    names = [known for known in dir(cv2.aruco) if known.startswith("DICT_") and known.isupper()]
+    if name not in names:
+        raise ValueError(f"there is no ArUco dictionary {name!r}; expected one of {', '.join(sorted(names))}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def _larger(dictionary: str) -> str:
+    family = re.match(r"DICT_[0-9]X[0-9]_", dictionary)
+    return f"{family.group()}1000" if family else "DICT_4X4_1000"
+
+
+def _shape(text: str, spec: str) -> tuple[int, int]:
+    match = _SHAPE.fullmatch(text)
+    if match is None:
+        raise ValueError(f"the shape {text!r} in the board {spec!r} is not of the form 9x6; expected {_EXAMPLES}")
+    return int(match["columns"]), int(match["rows"])
+
+
+def _length(text: str, spec: str) -> float:
+    match = _LENGTH.fullmatch(text)
+    if match is None:
+        raise ValueError(f"the length {text!r} in the board {spec!r} is not a number with a unit, such as 25mm")
+    if match["unit"] not in _METRES:
+        given = f"has the unit {match['unit']!r}" if match["unit"] else "has no unit"
+        raise ValueError(f"the length {text!r} in the board {spec!r} {given}; expected mm, cm or m, such as 25mm")
+    # divide: 25 / 1000 is the float64 nearest to 0.025, 25 * 1e-3 need not be
+    return float(match["value"]) / round(1 / _METRES[match["unit"]])
+
+
+def _words(metres: float) -> str:
+    """Shortest decimal in mm that reads back as exactly this float64 (in m where whole, or where there is none)."""
+    if metres == int(metres):
+        return f"{int(metres)}m"
+    for digits in range(1, 18):
+        text = f"{metres * 1000:.{digits}g}"
+        if float(text) / 1000 == metres:
+            return f"{float(text)!r}".removesuffix(".0") + "mm"
+    return f"{metres!r}m"
