@@ -219,10 +219,10 @@ def _corners(solution: Solution, role: str) -> Array:
 
 
 def _frustum(rig: Rig, role: str) -> Array:
-    """Centre of projection and four corner directions of a camera, (5, 3), in the rig's frame."""
+    """Centre of projection and the directions to the middles of the image's edges, (5, 3), in the rig's frame."""
     camera = rig.dry if role == "dry" else rig.wet
     right, bottom = camera.width - 1, camera.height - 1
-    rays = camera.unproject(np.array([[0, 0], [right, 0], [right, bottom], [0, bottom]]))
+    rays = camera.unproject(np.array([[0, bottom / 2], [right, bottom / 2], [right / 2, 0], [right / 2, bottom]]))
     outward = np.where(np.isfinite(rays), rays, np.array([0, 0, 1.0]))
     return transform(invert(camera.rt_cam_ref), np.concatenate([np.zeros((1, 3)), outward]))
 

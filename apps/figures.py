@@ -144,7 +144,7 @@ def rig_view(
     """Boards, cameras and panels from above and from the side, and the rig itself enlarged.
 
     boards : (N, 4, 3) outline of each board, metres, rig frame (x right, y down, z forward).
-    cameras : role -> (5, 3) centre of projection and the four corners of its view, at any distance.
+    cameras : role -> (5, 3) centre of projection and four points that bound its view, at any distance.
     panels : (M, 4, 3) outline of each panel. rejected : (N,) bool, boards drawn in red.
     """
     outlines = np.asarray(boards, float).reshape(-1, 4, 3)

@@ -79,8 +79,8 @@ def choose_lensmodel(
     """Choose among lens models given from simple to rich; "splined" stands for one that suits the field of view.
 
     progress: called with a model's name before it is tried. ValueError where there is no candidate; SolveError where
-    none can be solved. With fewer than MIN_FRAMES different views the first that can be solved is taken: holding frames out
-    says nothing then.
+    none can be solved. With fewer than MIN_FRAMES different views the first that can be solved is taken: holding
+    frames out says nothing then.
     """
     if not candidates:
         raise ValueError("no lens model to choose from was given; expected names such as LENSMODEL_OPENCV8")
