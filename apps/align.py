@@ -83,7 +83,7 @@ def run(options: Options) -> int:
             "0001.png and 0001.png, or left1.png and right1.png"
         )
     alignment = plan(rig, plane)
-    skipped = [(str(path), reason) for path, reason in pairing.unpaired]
+    skipped = [(str(file.path), file.reason) for file in pairing.unpaired]
     for role in ROLES:
         (options.out / role).mkdir(parents=True, exist_ok=True)
     done = []

@@ -10,7 +10,7 @@ import numpy as np
 
 from .types import Image
 
-SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"})
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp", ".jp2"})
 MAX_BYTES = 1 << 30
 
 
@@ -23,14 +23,17 @@ def read(path: str | os.PathLike[str], *, gray: bool = False) -> Image:
 
     UnreadableImageError for anything else, truncated files among it: decoders fill what is missing with gray.
     """
-    path = Path(path)
+    return decode(read_bytes(path), gray=gray)
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """The bytes of a file of bounded size; UnreadableImageError where there are none to be had."""
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if Path(path).stat().st_size > MAX_BYTES:
             raise UnreadableImageError(f"larger than {MAX_BYTES >> 20} MiB")
-        data = path.read_bytes()
+        return Path(path).read_bytes()
     except OSError as error:
         raise UnreadableImageError(f"cannot be read ({error.strerror or error})") from error
-    return decode(data, gray=gray)
 
 
 def decode(data: bytes, *, gray: bool = False) -> Image:

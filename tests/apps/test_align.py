@@ -97,7 +97,7 @@ def test_bad_files_are_skipped_by_name_and_the_rest_is_aligned(recording: Path, 
     assert reasons["001.png"].startswith("truncated")
     assert reasons["900.png"] == "zero bytes"
     assert reasons["901.png"] == "64 x 48 pixels; the rig was calibrated at 640 x 480"
-    assert reasons["902.png"] == "no wet image of this name"
+    assert reasons["902.png"] == "has no partner among the 5 wet images"
     for role in ("dry", "wet"):
         assert sorted(p.name for p in (tmp_path / "out" / role).iterdir()) == ["000.png", "002.png"]
 
@@ -116,7 +116,7 @@ def test_nothing_to_align_is_a_failure(recording: Path, tmp_path: Path) -> None:
         (["--plane", "5 feet"], "expected infinity, a depth like 5m"),
         (["--interpolation", "best"], "interpolation 'best' is unknown"),
         (["--rig", "absent"], "absent is no folder; expected a rig folder"),
-        (["--dry", "absent"], "absent is no folder and matches no image"),
+        (["--dry", "absent"], "absent, given for the dry images, does not exist"),
     ],
 )
 def test_bad_usage_is_explained(

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rainstereo.calib import corners
+from rainstereo import imagefile
+from rainstereo.calib import charuco, chessboard, corners, saddles
 from rainstereo.calib.board import Board
 from rainstereo.types import Array, Image
 
@@ -142,18 +143,18 @@ def test_a_part_that_a_search_found_is_seen_to_go_on(side: int) -> None:
     H = homography(CHESSBOARD, 7)
     fine = render(CHESSBOARD, H).astype(np.float32)
     part = through(H, CHESSBOARD.points)[1:5, ::side][:, :5]
-    assert corners._extent(fine, part) == (9, 6)
-    assert corners._extent(fine, through(H, CHESSBOARD.points)) == (9, 6)
+    assert chessboard.extent(fine, part) == (9, 6)
+    assert chessboard.extent(fine, through(H, CHESSBOARD.points)) == (9, 6)
 
 
 def test_a_search_that_steps_over_rows_is_not_believed() -> None:
     H = homography(CHESSBOARD, 7)
     fine = render(CHESSBOARD, H).astype(np.float32)
     truth = through(H, CHESSBOARD.points)
-    assert corners._checkered(fine, truth)
-    assert not corners._checkered(fine, truth[::2])
+    assert chessboard.checkered(fine, truth)
+    assert not chessboard.checkered(fine, truth[::2])
     askew = np.stack([truth[2 * row, row : row + 6] for row in range(3)])  # down two and right one alternates too
-    assert not corners._checkered(fine, askew)
+    assert not chessboard.checkered(fine, askew)
 
 
 def test_a_transposed_description_is_the_same_board() -> None:
@@ -242,12 +243,12 @@ def test_another_charuco_board_is_refused_and_named(asked: str, words: str) -> N
 def test_markers_in_the_wrong_place_are_outvoted() -> None:
     H = homography(CHARUCO, 10)
     truth = through(H, CHARUCO.points)
-    identities, quads = corners._markers(render(CHARUCO, H), CHARUCO)
+    identities, quads = charuco.find_markers(render(CHARUCO, H), CHARUCO)
     identities[[3, 17]] = identities[[17, 3]]
     on_board = np.array(CHARUCO.charuco().getObjPoints())[identities][..., :2] / CHARUCO.square - 1
-    agree = corners._consistent(on_board, quads, np.ones(len(quads), dtype=bool))
+    agree = charuco.consistent(on_board, quads, np.ones(len(quads), dtype=bool))
     np.testing.assert_array_equal(np.flatnonzero(~agree), [3, 17])
-    guess = corners._from_markers(CHARUCO, on_board[agree], quads[agree])
+    guess = charuco.from_markers(CHARUCO, on_board[agree], quads[agree])
     assert np.nanmax(np.abs(guess - truth)) < 2.5
 
 
@@ -273,41 +274,9 @@ def test_what_is_not_an_image_is_refused(image: Image) -> None:
 def test_gray_between_pixels_is_bilinear(rng: np.random.Generator) -> None:
     plane = (2.0 * np.arange(7) + 3.0 * np.arange(5)[:, None]).astype(np.float32)
     xy = rng.uniform((0, 0), (6, 4), (20, 2))
-    np.testing.assert_allclose(corners._sample(plane, xy), 2 * xy[:, 0] + 3 * xy[:, 1], rtol=1e-12)
+    np.testing.assert_allclose(saddles.sample(plane, xy), 2 * xy[:, 0] + 3 * xy[:, 1], rtol=1e-12)
     edges = np.array([[0.0, 0], [6, 4], [6.01, 1], [-0.01, 1], [1, 4.01], [np.nan, 1]])
-    np.testing.assert_allclose(corners._sample(plane, edges), [0, 24, *[np.nan] * 4], rtol=1e-12)
-
-
-def test_damaged_files_are_named_not_raised(tmp_path: Path) -> None:
-    image = render(CHESSBOARD, homography(CHESSBOARD))
-    for suffix in (".png", ".jpg", ".tiff", ".bmp", ".pgm", ".webp"):
-        whole = cv2.imencode(suffix, image)[1].tobytes()
-        path = tmp_path / f"board{suffix}"
-        path.write_bytes(whole)
-        read, reason = corners.read_gray(path)
-        assert read is not None, suffix
-        assert reason == ""
-        assert np.abs(read.astype(int) - image).max() < 90
-        for share in (0.02, 0.5, 0.95):
-            path.write_bytes(whole[: int(len(whole) * share)])
-            read, reason = corners.read_gray(path)
-            assert read is None, (suffix, share)
-            assert reason
-    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
-    assert corners.decode_gray(jpeg[:-2]) == (None, "truncated: the file ends before the image does")
-    thumbnail = jpeg[:2] + b"\xff\xe1" + (len(jpeg[:20000]) + 2).to_bytes(2, "big") + jpeg[:20000] + jpeg[2:-2000]
-    assert corners.decode_gray(thumbnail)[1].startswith("truncated")
-    assert corners.decode_gray(b"") == (None, "zero bytes")
-    assert corners.decode_gray(b"hello, this is text") == (None, "not an image, or a damaged one")
-    assert corners.read_gray(tmp_path / "missing.png")[1].startswith("cannot be read")
-    assert corners.read_gray(tmp_path)[1].startswith("cannot be read")
-
-
-def test_depth_is_kept_and_other_pixels_are_refused(tmp_path: Path) -> None:
-    deep = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64) * 16
-    np.testing.assert_array_equal(corners.decode_gray(cv2.imencode(".png", deep)[1].tobytes())[0], deep)
-    floats = cv2.imencode(".tiff", deep.astype(np.float32))[1].tobytes()
-    assert "float32" in corners.decode_gray(floats)[1]
+    np.testing.assert_allclose(saddles.sample(plane, edges), [0, 24, *[np.nan] * 4], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -326,8 +295,7 @@ def test_depth_is_kept_and_other_pixels_are_refused(tmp_path: Path) -> None:
 def test_real_boards(shared_data: Path, folder: str, spec: str, images: list[str], least: int) -> None:
     board = Board.parse(spec)
     for name in images:
-        image, reason = corners.read_gray(shared_data / "calib" / folder / name)
-        assert image is not None, reason
+        image = imagefile.read(shared_data / "calib" / folder / name, gray=True)
         detection = corners.detect(image, board)
         assert detection, f"{name}: {detection.reason}"
         assert np.isfinite(detection.xy[..., 0]).sum() >= least
@@ -338,7 +306,6 @@ def test_real_boards(shared_data: Path, folder: str, spec: str, images: list[str
 def test_real_boards_of_another_shape(shared_data: Path) -> None:
     folder = shared_data / "calib" / "opencv_chess_640x480"
     for name in ("left01.jpg", "left13.jpg"):
-        image, _ = corners.read_gray(folder / name)
-        assert image is not None
+        image = imagefile.read(folder / name, gray=True)
         for asked in ("6x5", "8x6", "10x7"):
             assert not corners.detect(image, Board.parse(f"chessboard:{asked}:1m")), f"{name} {asked}"

@@ -1,7 +1,6 @@
 """From files to a table: pairing by name, refusals by name, one order for both cameras."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -11,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rainstereo.calib import corners, observations
+from rainstereo.calib import board_search, corners
 from rainstereo.calib.board import Board
-from rainstereo.calib.observations import NotEnoughData, Observations, Rejection
+from rainstereo.calib.detection import Detection
+from rainstereo.calib.observations import Observations
+from rainstereo.calib.rejection import NotEnoughData, Rejection
 from rainstereo.types import Array, Image
 
 BOARD = Board.parse("chessboard:9x6:25mm")
@@ -146,11 +147,11 @@ def test_the_wrong_shape_is_refused_with_the_right_one(tmp_path: Path, asked: st
 
 
 def test_empty_and_missing_folders(tmp_path: Path, recording: Path) -> None:
-    with pytest.raises(NotEnoughData, match="there is no wet image"):
+    with pytest.raises(FileNotFoundError, match="there is no wet image"):
         Observations.from_folders(recording / "dry", tmp_path, BOARD)
-    with pytest.raises(NotEnoughData, match="does not exist"):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
         Observations.from_folders(tmp_path / "nowhere", recording / "wet", BOARD)
-    with pytest.raises(NotEnoughData, match="there is no dry image"):
+    with pytest.raises(FileNotFoundError, match="there is no dry image"):
         Observations.from_folders(f"{tmp_path}/*.png", recording / "wet", BOARD)
     with pytest.raises(ValueError, match="the same images were given"):
         Observations.from_folders(recording / "dry", recording / "dry", BOARD)
@@ -174,44 +175,8 @@ def test_swapped_cameras_are_noticed(tmp_path: Path, dry: str, wet: str) -> None
     ],
 )
 def test_unsuspicious_names_are_not_taken_for_swapped(tmp_path: Path, dry: str, wet: str) -> None:
-    with pytest.raises(NotEnoughData, match="does not exist"):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
         Observations.from_folders(tmp_path / dry, tmp_path / wet, BOARD)
-
-
-@pytest.mark.parametrize(
-    ("dry", "wet", "names"),
-    [
-        (["left01.jpg", "left02.jpg"], ["right02.jpg", "right01.jpg"], ["01", "02"]),
-        (["left_01.png", "left_02.png"], ["right_01.png", "right_02.png"], ["01", "02"]),
-        (["left_p0_0.png", "left_p1_3.png"], ["right_p0_0.png", "right_p1_3.png"], ["p0_0", "p1_3"]),
-        (["001-dry.png", "002-dry.png"], ["001-wet.png", "002-wet.png"], ["001", "002"]),
-        (["img_L_1.png", "img_L_2.png"], ["img_R_1.png", "img_R_2.png"], ["img_1", "img_2"]),
-        (["boardLeft1.png", "boardLeft2.png"], ["boardRight1.png", "boardRight2.png"], ["board_1", "board_2"]),
-        (["cam0_7.png", "cam0_8.png"], ["cam1_7.png", "cam1_8.png"], ["7", "8"]),
-        (["cam_01.png", "cam_02.png"], ["cam_01.png", "cam_02.png"], ["cam_01", "cam_02"]),
-        (["1400505794141322.png", "1400505794203.png"], ["1400505794141322.png"], ["1400505794141322"]),
-        (
-            ["basler_4411_0001.png", "basler_4411_0002.png"],
-            ["basler_9876_0001.png", "basler_9876_0002.png"],
-            ["0001", "0002"],
-        ),
-        (["lower.png", "drying.png"], ["lower.png", "drying.png"], ["lower", "drying"]),
-    ],
-)
-def test_pairs_by_name(dry: list[str], wet: list[str], names: list[str]) -> None:
-    pairs, rejected = observations._pair([Path("a") / name for name in dry], [Path("b") / name for name in wet])
-    assert [pair.name for pair in pairs] == names
-    for pair in pairs:
-        assert re.findall(r"[0-9]+", pair.dry.stem)[-1:] == re.findall(r"[0-9]+", pair.wet.stem)[-1:]
-    assert len(rejected) == len(dry) + len(wet) - 2 * len(names)
-
-
-def test_a_name_used_twice_pairs_nothing() -> None:
-    pairs, rejected = observations._pair(
-        [Path("x/left1.png"), Path("y/left1.png"), Path("left2.png")], [Path("right1.png"), Path("right2.png")]
-    )
-    assert [pair.name for pair in pairs] == ["2"]
-    assert [(r.name, r.role) for r in rejected] == [("left1.png", "dry"), ("left1.png", "dry"), ("right1.png", "wet")]
 
 
 def test_one_folder_with_two_globs(tmp_path: Path) -> None:
@@ -237,7 +202,7 @@ def test_both_cameras_number_a_symmetric_board_alike(dry_deg: int, relative_deg:
     roll = relative_deg / 2  # of the cameras to each other: below 45 degrees
     dry, wet = seen(dry_deg), seen(dry_deg + roll)
     choices = corners.indistinguishable(wet, board)
-    chosen = observations._order_alike(dry, choices[turn % len(choices)], board)[1]
+    chosen = board_search._order_alike(dry, choices[turn % len(choices)], board)[1]
     np.testing.assert_allclose(chosen, wet, atol=1e-9)
 
 
@@ -245,11 +210,11 @@ def test_flips_are_put_right_on_images(tmp_path: Path, monkeypatch: pytest.Monke
     write(tmp_path, SYMMETRIC, 3)
     honest = corners.detect
 
-    def flipping(image: Image, board: Board, **options: bool) -> corners.Detection:
+    def flipping(image: Image, board: Board, **options: bool) -> Detection:
         """As a search that starts at either end, by chance: the wet camera's images are the smaller ones."""
         found = honest(image, board, **options)
         turned = found.xy[::-1, ::-1] if image.shape[1] == SIZE["wet"][0] else found.xy
-        return corners.Detection(turned, found.reason)
+        return Detection(turned, found.reason)
 
     monkeypatch.setattr(corners, "detect", flipping)
     seen = Observations.from_folders(tmp_path / "dry", tmp_path / "wet", SYMMETRIC)
@@ -263,12 +228,12 @@ def test_one_layout_for_all_charuco_images() -> None:
     board = Board.parse("charuco:5x4:25mm:18mm:DICT_4X4_50")
     narrow, wide = np.full((3, 4, 2), np.nan), np.ones((3, 4, 2))
     narrow[:, :2] = 1.0
-    torn = corners.Detection(narrow, legacy=False, other=corners.Detection(narrow + 1, legacy=True))
-    plain = corners.Detection(wide, legacy=True, other=corners.Detection(narrow, legacy=False))
-    only_modern = corners.Detection(np.where(np.arange(4)[:, None] < 1, narrow, np.nan), legacy=False)
-    blind = corners.Detection(np.full((3, 4, 2), np.nan), "zero bytes")
-    found = {Path(str(i)): observations._Found((9, 9), d) for i, d in enumerate((torn, plain, only_modern, blind))}
-    agreed = [one.detection for one in observations._one_layout(found).values()]
+    torn = Detection(narrow, legacy=False, other=Detection(narrow + 1, legacy=True))
+    plain = Detection(wide, legacy=True, other=Detection(narrow, legacy=False))
+    only_modern = Detection(np.where(np.arange(4)[:, None] < 1, narrow, np.nan), legacy=False)
+    blind = Detection(np.full((3, 4, 2), np.nan), "zero bytes")
+    found = {Path(str(i)): board_search.Found((9, 9), d) for i, d in enumerate((torn, plain, only_modern, blind))}
+    agreed = [one.detection for one in board_search._one_layout(found).values()]
     assert board.squares[1] % 2 == 0
     assert [detection.legacy for detection in agreed[:2]] == [True, True]
     np.testing.assert_array_equal(agreed[0].xy, narrow + 1)
@@ -358,7 +323,7 @@ def test_corners_are_remembered_by_content(folders: Path, tmp_path: Path, monkey
     searched = []
     honest = corners.detect
 
-    def counting(image: Image, board: Board, **options: bool) -> corners.Detection:
+    def counting(image: Image, board: Board, **options: bool) -> Detection:
         searched.append(image.shape)
         return honest(image, board, **options)
 

@@ -1,5 +1,6 @@
 """Image files and pairs of them: whole or not at all, and matched by what their names share."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -29,11 +30,22 @@ def test_what_is_written_is_read(tmp_path: Path, suffix: str, image: np.ndarray)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]  # nothing temporary is left
 
 
+def test_other_pixels_and_thumbnails_are_not_mistaken() -> None:
+    jpeg = cv2.imencode(".jpg", PICTURE)[1].tobytes()
+    thumbnail = jpeg[:2] + b"\xff\xe1" + (len(jpeg) + 2).to_bytes(2, "big") + jpeg + jpeg[2:-40]
+    with pytest.raises(UnreadableImageError, match="truncated"):
+        imagefile.decode(thumbnail)  # its thumbnail is whole, the image is not
+    floats = cv2.imencode(".tiff", DEEP.astype(np.float32))[1].tobytes()
+    with pytest.raises(UnreadableImageError, match="float32"):
+        imagefile.decode(floats)
+
+
 def test_every_cut_of_a_file_is_refused(tmp_path: Path) -> None:
-    for suffix in (".png", ".jpg"):
+    for suffix in (".png", ".jpg", ".tiff", ".bmp", ".ppm", ".webp"):
         data = cv2.imencode(suffix, PICTURE)[1].tobytes()
         assert imagefile.decode(data).shape == PICTURE.shape
-        for cut in (*range(1, 40, 7), len(data) // 2, len(data) - 20, len(data) - 3):
+        tail = (len(data) - 20, len(data) - 3) if suffix in (".png", ".jpg") else ()
+        for cut in (*range(1, 40, 7), len(data) // 2, *tail):
             with pytest.raises(UnreadableImageError):
                 imagefile.decode(data[:cut])
 
@@ -71,48 +83,61 @@ def touch(folder: Path, *names: str) -> str:
 @pytest.mark.parametrize(
     ("dry", "wet", "names"),
     [
-        (["0001.png", "0002.png"], ["0002.png", "0001.png"], ["0001", "0002"]),
-        (["left01.jpg", "left02.jpg"], ["right01.jpg", "right02.jpg"], ["01", "02"]),
-        (["left_pA_B.png"], ["right_pA_B.png"], ["pA_B"]),
-        (["dry-7.png"], ["wet-7.jpg"], ["7"]),
-        (["12_l.png"], ["12_r.png"], ["12"]),
-        (["cam0_5.png"], ["cam1_5.png"], ["5"]),
-        (["1520000000123456.png"], ["1520000000123456.png"], ["1520000000123456"]),
+        (["left01.jpg", "left02.jpg"], ["right02.jpg", "right01.jpg"], ["01", "02"]),
+        (["left_01.png", "left_02.png"], ["right_01.png", "right_02.png"], ["01", "02"]),
+        (["left_p0_0.png", "left_p1_3.png"], ["right_p0_0.png", "right_p1_3.png"], ["p0_0", "p1_3"]),
+        (["001-dry.png", "002-dry.png"], ["001-wet.png", "002-wet.png"], ["001", "002"]),
+        (["img_L_1.png", "img_L_2.png"], ["img_R_1.png", "img_R_2.png"], ["img_1", "img_2"]),
+        (["boardLeft1.png", "boardLeft2.png"], ["boardRight1.png", "boardRight2.png"], ["board_1", "board_2"]),
+        (["cam0_7.png", "cam0_8.png"], ["cam1_7.png", "cam1_8.png"], ["7", "8"]),
+        (["cam_01.png", "cam_02.png"], ["cam_01.png", "cam_02.png"], ["cam_01", "cam_02"]),
+        (["1400505794141322.png", "1400505794203.png"], ["1400505794141322.png"], ["1400505794141322"]),
+        (
+            ["basler_4411_0001.png", "basler_4411_0002.png"],
+            ["basler_9876_0001.png", "basler_9876_0002.png"],
+            ["0001", "0002"],
+        ),
+        (["lower.png", "drying.png"], ["lower.png", "drying.png"], ["lower", "drying"]),
     ],
 )
-def test_pairs_by_name(tmp_path: Path, dry: list[str], wet: list[str], names: list[str]) -> None:
-    pairing = match(touch(tmp_path / "a", *dry), touch(tmp_path / "b", *wet))
-    assert [pair.name for pair in pairing.pairs] == names
-    assert not pairing.unpaired
-    assert all(pair.dry.parent.name == "a" and pair.wet.parent.name == "b" for pair in pairing.pairs)
+def test_pairs_by_name(dry: list[str], wet: list[str], names: list[str]) -> None:
+    pairing = match([Path("a") / name for name in dry], [Path("b") / name for name in wet])
+    pairs, rejected = pairing.pairs, pairing.unpaired
+    assert [pair.name for pair in pairs] == names
+    for pair in pairs:
+        assert re.findall(r"[0-9]+", pair.dry.stem)[-1:] == re.findall(r"[0-9]+", pair.wet.stem)[-1:]
+    assert len(rejected) == len(dry) + len(wet) - 2 * len(names)
 
 
-def test_files_without_a_partner_are_named(tmp_path: Path) -> None:
+def test_a_name_used_twice_pairs_nothing() -> None:
     pairing = match(
-        touch(tmp_path / "a", "left1.png", "left2.png", "notes.txt"), touch(tmp_path / "b", "right2.png", "right3.png")
+        [Path("x/left1.png"), Path("y/left1.png"), Path("left2.png")], [Path("right1.png"), Path("right2.png")]
     )
-    assert [pair.name for pair in pairing.pairs] == ["2"]
-    assert [(path.name, reason) for path, reason in pairing.unpaired] == [
-        ("left1.png", "no wet image of this name"),
-        ("right3.png", "no dry image of this name"),
+    pairs, rejected = pairing.pairs, pairing.unpaired
+    assert [pair.name for pair in pairs] == ["2"]
+    left_over = [("left1.png", "dry"), ("left1.png", "dry"), ("right1.png", "wet")]
+    assert [(r.path.name, r.role) for r in rejected] == left_over
+
+
+def test_folders_and_globs(tmp_path: Path) -> None:
+    touch(tmp_path / "a", "left2.png", "left1.png", "right1.png", "notes.txt", ".left3.png")
+    pairing = match(str(tmp_path / "a" / "left*"), tmp_path / "a" / "right1.png")
+    assert [(pair.name, pair.dry.name, pair.wet.name) for pair in pairing.pairs] == [("1", "left1.png", "right1.png")]
+    assert [(file.path.name, file.reason) for file in pairing.unpaired] == [
+        ("left2.png", "has no partner among the 1 wet images")
     ]
-
-
-def test_one_folder_and_two_globs(tmp_path: Path) -> None:
-    touch(tmp_path / "a", "left1.png", "right1.png")
-    pairing = match(str(tmp_path / "a" / "left*"), str(tmp_path / "a" / "right*"))
-    assert [(pair.dry.name, pair.wet.name) for pair in pairing.pairs] == [("left1.png", "right1.png")]
+    assert [path.name for path in list_images(tmp_path / "a", "dry")] == ["left1.png", "left2.png", "right1.png"]
 
 
 def test_what_cannot_be_paired_is_explained(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="holds no image"):
-        list_images(touch(tmp_path / "empty"))
-    with pytest.raises(FileNotFoundError, match="is no folder and matches no image"):
-        list_images(str(tmp_path / "absent"))
+    with pytest.raises(FileNotFoundError, match="there is no dry image at"):
+        list_images(touch(tmp_path / "empty"), "dry")
+    with pytest.raises(FileNotFoundError, match="given for the wet images, does not exist"):
+        list_images(str(tmp_path / "absent"), "wet")
     both = touch(tmp_path / "both", "left1.png", "right1.png")
-    with pytest.raises(ValueError, match="same name apart from their role"):
+    with pytest.raises(ValueError, match="the same images were given for both cameras"):
         match(both, both)
     dry, wet = touch(tmp_path / "dry", "1.png"), touch(tmp_path / "wet", "1.png")
-    with pytest.raises(ValueError, match="the cameras are swapped"):
+    with pytest.raises(ValueError, match="the cameras look swapped"):
         match(wet, dry)
     assert len(match(dry, wet).pairs) == 1
