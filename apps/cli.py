@@ -58,6 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = os.environ.get("RAINSTEREO_DEBUG", "0") not in ("", "0")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # we name damaged files ourselves
     while "--debug" in arguments:
         arguments.remove("--debug")
         debug = True

@@ -1,0 +1,77 @@
+"""Which of many drops on a face may a ray meet? A grid over the face answers for thousands of rays at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .droplet import Drop
+from .types import Array, Indices
+
+NOBODY = -1
+"""The number of no drop."""
+CELLS = 256  # along each side, at most
+
+
+class DropGrid:
+    """Drops on a face, sorted into the cells of a grid.
+
+    A ray belongs to the drop in whose circle (of radius `reach`) its point of the face lies deepest: the one of
+    smallest d^2 - reach^2, d the distance from the centre. So circles that overlap part along their common chord, and
+    the order of the drops does not matter. Beside all circles it belongs, within `margin` heights, to the drop it is
+    closest to in the same sense.
+    """
+
+    def __init__(self, drops: dict[int, Drop], origin: Array, margin: float) -> None:
+        self.margin = margin
+        self.numbers = np.array([*drops, NOBODY])
+        centres = np.array([origin[:2] + np.asarray(drop.centre) for drop in drops.values()])
+        reach = np.array([drop.reach for drop in drops.values()])
+        wide = reach + margin * np.array([drop.top for drop in drops.values()])
+        self.table = np.concatenate([centres.T, [reach**2], [wide**2]])
+        self.low = (centres - wide[:, None]).min(0)
+        extent = (centres + wide[:, None]).max(0) - self.low
+        self.cell = max(float(np.median(wide)), float(extent.max()) / CELLS)
+        self.size = np.maximum(np.ceil(extent / self.cell).astype(int), 1)
+        self.candidates = self._sort(centres, wide)
+
+    def _sort(self, centres: Array, wide: Array) -> Indices:
+        """Rows of the drops that reach each cell, (most in any cell, cells); the last cell is outside everything."""
+        first = np.floor((centres - wide[:, None] - self.low) / self.cell).astype(np.intp).clip(0, self.size - 1)
+        last = np.floor((centres + wide[:, None] - self.low) / self.cell).astype(np.intp).clip(0, self.size - 1)
+        across, down = (last - first + 1).T
+        count = across * down
+        row = np.repeat(np.arange(len(centres)), count)
+        step = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)  # number of the cell within the drop
+        cell = (first[row, 1] + step // across[row]) * self.size[0] + first[row, 0] + step % across[row]
+        order = np.argsort(cell, kind="stable")
+        cell, row = cell[order], row[order]
+        layer = np.arange(len(cell)) - np.searchsorted(cell, cell)
+        table = np.full((int(layer.max()) + 1, int(self.size.prod()) + 1), NOBODY)
+        table[layer, cell] = row
+        return table
+
+    def whose(self, x: Array, y: Array) -> Indices:
+        """Number of the drop that the ray through each point of the face, (N,), may meet; `NOBODY` if none."""
+        # single precision will do: whether the ray then meets its drop is decided elsewhere, in full
+        x, y = x.astype(np.float32), y.astype(np.float32)
+        u, v = (x - float(self.low[0])) / self.cell, (y - float(self.low[1])) / self.cell
+        inside = (u >= 0) & (u < self.size[0]) & (v >= 0) & (v < self.size[1])
+        cell = np.where(inside, np.floor(v) * self.size[0] + np.floor(u), len(self.candidates[0]) - 1).astype(np.intp)
+        owner = np.full(len(x), NOBODY)
+        best = np.full(len(x), np.inf, dtype=x.dtype)
+        cx, cy, square, wide = self.table.astype(x.dtype)
+        for layer in self.candidates:
+            row = layer[cell]
+            at = np.flatnonzero(row >= 0)
+            if not at.size:
+                break
+            row = row[at]
+            dx, dy = x[at] - cx[row], y[at] - cy[row]
+            d2 = dx * dx + dy * dy
+            depth = d2 - square[row]
+            closer = (depth < best[at]) & (d2 < wide[row])
+            at = at[closer]
+            best[at] = depth[closer]
+            owner[at] = row[closer]
+        numbers: Indices = self.numbers[owner]
+        return numbers
