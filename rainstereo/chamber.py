@@ -12,6 +12,7 @@ import os
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -92,13 +93,15 @@ class Chamber:
         object.__setattr__(self, "panels", panels)
         object.__setattr__(self, "gaps", gaps)
 
-    @property
+    @cached_property
     def faces(self) -> Array:
-        """Distance of each panel's near face along the normal, (panels,) metres."""
+        """Distance of each panel's near face along the normal, (panels,) metres, read-only."""
         steps = [panel.thickness + gap for panel, gap in zip(self.panels[:-1], self.gaps, strict=True)]
-        return np.array([self.distance + sum(steps[:i]) for i in range(len(self.panels))])
+        faces = np.array([self.distance + sum(steps[:i]) for i in range(len(self.panels))])
+        faces.setflags(write=False)
+        return faces
 
-    @property
+    @cached_property
     def depth(self) -> float:
         """Distance of the last face along the normal, metres; inf if the last panel has no end."""
         return float(self.faces[-1] + self.panels[-1].thickness) if self.panels else self.distance
