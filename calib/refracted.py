@@ -2,8 +2,8 @@
 
 A camera at the reference frame's point C, turned by R, sees a point P at f(R a(P - C)): a() moves the point to where it
 seems to be (`refraction.apparent`, in the reference frame's orientation, in which the panels stand still), f is the
-lens. mrcal knows f and its derivatives; those of a() are differences; the rest is the chain rule. The state
-is mrcal's, packed, and its regularization is taken over as it is.
+lens. mrcal knows f and its derivatives, `refraction` those of a(); the rest is the chain rule. The state is mrcal's,
+packed, and its regularization is taken over as it is.
 """
 
 from __future__ import annotations
@@ -18,9 +18,6 @@ from rainstereo.calib.mrcal_versions import Problem, SolveError
 from rainstereo.calib.rotation import rotated_by
 from rainstereo.chamber import Chamber
 from rainstereo.types import Array
-
-STEP = 1e-6
-"""Metres by which points are moved to differentiate `apparent`: rounding costs 1e-10 of the derivative."""
 
 
 class ChamberError(SolveError):
@@ -107,7 +104,8 @@ def _rows(
     views, count = len(frames), apparent[0].size // 3
     seen, by_point, by_lens = versions.project_gradients(apparent, problem.lensmodel, problem.intrinsics[camera])
     by_centred = by_point @ R  # a turned, derivative by a
-    moved = _bends(u, chamber)
+    _, moved, _ = refraction.apparent_jacobian(u.reshape(-1, 3), _centred(chamber, -R.T @ rt[3:]))
+    moved = moved.reshape(*u.shape, 3)
     by_reference = (by_centred @ moved).reshape(views, count, 2, 3)
     parts: list[Array] = [by_lens[..., layout.intrinsics_columns].reshape(views, count, 2, -1)]
     columns: list[Array] = [np.tile(_range(layout.intrinsics[camera]), (views, 1))]
@@ -152,17 +150,6 @@ def _apparent(problem: Problem, chamber: Chamber, camera: int) -> tuple[Array, A
             "check its normal, which points from the cameras to the scene"
         )
     return rows, u, moved.reshape(u.shape) @ R.T
-
-
-def _bends(u: Array, chamber: Chamber) -> Array:
-    """Derivative of `apparent` by the point, (..., 3, 3)."""
-    inside = _centred(chamber, np.zeros(3))
-    flat = u.reshape(-1, 3)
-    columns = [
-        (refraction.apparent(flat + step, inside)[0] - refraction.apparent(flat - step, inside)[0]) / (2 * STEP)
-        for step in np.eye(3) * STEP
-    ]
-    return np.asarray(np.stack(columns, -1).reshape(*u.shape, 3))
 
 
 def _centred(chamber: Chamber, centre: Array) -> Chamber:

@@ -275,6 +275,45 @@ def jacobian(points: Array, camera: Camera, chamber: Chamber) -> Jacobian:
     points: (N, 3) metres in the camera's frame. On a face, where the equation has a kink, the derivative is
     that of the side away from the camera.
     """
+    bend = _bend(points, chamber)
+    normal = np.asarray(chamber.normal)
+    pixels, J = camera.project_jacobian(bend.seen)
+    J_n = J @ normal
+    lost = np.isnan(pixels[:, 0])
+    flat = np.eye(3) - np.outer(normal, normal)
+    return Jacobian(
+        pixels,
+        status=np.where(lost & (bend.status == Status.SEEN), Status.NO_IMAGE, bend.status).astype(np.uint8),
+        point=J - J_n[:, :, None] * bend.by_point[:, None, :],
+        normal=-bend.delta[:, None, None] * (J @ flat) - J_n[:, :, None] * bend.by_normal[:, None, :],
+        thickness=-J_n[:, :, None] * bend.by_thickness[:, None, :],
+        index=-J_n[:, :, None] * bend.by_index[:, None, :],
+        distance=-J_n * bend.by_distance[:, None],
+    )
+
+
+def apparent_jacobian(points: Array, chamber: Chamber) -> tuple[Array, Array, types.Status]:
+    """`apparent` of points, (N, 3), its derivative with respect to the point, (N, 3, 3), and status, (N,)."""
+    bend = _bend(points, chamber)
+    normal = np.asarray(chamber.normal)
+    return bend.seen, np.eye(3) - normal[:, None] * bend.by_point[:, None, :], bend.status
+
+
+@dataclass(frozen=True, eq=False)
+class _Bend:
+    """P' of N points, and delta with its derivatives, by whatever name; NaN where a point is not seen."""
+
+    seen: Array
+    status: types.Status
+    delta: Array
+    by_point: Array
+    by_normal: Array
+    by_thickness: Array
+    by_index: Array
+    by_distance: Array
+
+
+def _bend(points: Array, chamber: Chamber) -> _Bend:
     points = floating(points, 3, "points").astype(np.float64)
     if points.ndim != 2:
         raise ValueError(f"points have shape {points.shape}; expected (N, 3)")
@@ -305,20 +344,13 @@ def jacobian(points: Array, camera: Camera, chamber: Chamber) -> Jacobian:
     G_r2 = (thickness * phi_r2).sum(-1)
     earlier = inside[:, :, None] & (np.arange(panels)[:, None] > np.arange(panels))  # [point, panel it is in, earlier]
     G_T = -np.where(beyond, 1 - phi, 0.0) + (earlier * (1 - phi)[:, :, None]).sum(1)
-
-    d_delta_point = -(G_z[:, None] * normal + 2 * G_r2[:, None] * across) / G_delta[:, None]
-    d_delta_normal = -(G_z - 2 * G_r2 * z)[:, None] * across / G_delta[:, None]
-    pixels, J = camera.project_jacobian(seen)
-    J_n = J @ normal
-    flat = np.eye(3) - np.outer(normal, normal)
-    lost = np.isnan(pixels[:, 0])
-    status = np.where(lost & (status == Status.SEEN), Status.NO_IMAGE, status).astype(np.uint8)
-    return Jacobian(
-        pixels,
+    return _Bend(
+        seen,
         status,
-        point=J - J_n[:, :, None] * d_delta_point[:, None, :],
-        normal=-delta[:, None, None] * (J @ flat) - J_n[:, :, None] * d_delta_normal[:, None, :],
-        thickness=J_n[:, :, None] * (G_T / G_delta[:, None])[:, None, :],
-        index=J_n[:, :, None] * (thickness * phi_n / G_delta[:, None])[:, None, :],
-        distance=J_n * (G_face / G_delta)[:, None],
+        delta,
+        by_point=-(G_z[:, None] * normal + 2 * G_r2[:, None] * across) / G_delta[:, None],
+        by_normal=-(G_z - 2 * G_r2 * z)[:, None] * across / G_delta[:, None],
+        by_thickness=-G_T / G_delta[:, None],
+        by_index=-thickness * phi_n / G_delta[:, None],
+        by_distance=-G_face / G_delta,
     )
