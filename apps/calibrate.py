@@ -15,7 +15,7 @@ from rainstereo import Chamber
 from rainstereo.apps.calibration_page import Findings, page
 from rainstereo.apps.cli import DONE, FAILED
 from rainstereo.apps.record import Record
-from rainstereo.calib import checks, uncertainty
+from rainstereo.calib import checks, mrcal_versions, uncertainty
 from rainstereo.calib.board import Board
 from rainstereo.calib.cross_validation import choose_lensmodel
 from rainstereo.calib.mrcal_versions import SolveError
@@ -60,6 +60,7 @@ def run(options: Options) -> int:
     record = Record("calibrate", options)
     board = Board.parse(options.board)
     chamber = None if options.chamber is None else Chamber.load(options.chamber)
+    mrcal_versions.load()  # rather than find out after the search that it is missing
     clock = Clock()
     with progress("looking for the board") as step:
         observations = Observations.from_folders(

@@ -134,7 +134,7 @@ def _explain(error: Exception) -> tuple[int, str]:
         return BAD_USAGE, words
     if isinstance(error, ValueError) and type(error).__name__ != "LinAlgError":  # that one is a solve that failed
         return BAD_USAGE, words
-    if isinstance(error, (RuntimeError, OSError, ArithmeticError, MemoryError)):
+    if isinstance(error, (RuntimeError, OSError, ArithmeticError, MemoryError, ImportError)):
         return FAILED, words
     return FAILED, f"unexpected {type(error).__name__}: {words}. Please report it with what --debug shows."
 

@@ -211,3 +211,17 @@ def test_bad_usage_is_explained(
     assert main(["calibrate", *(word for pair in options.items() for word in pair)]) == 2
     assert told in words(capsys)
     assert not (tmp_path / "rig").exists()
+
+
+def test_without_mrcal_it_says_so_before_it_searches(
+    boards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing() -> None:
+        raise ImportError("calibration needs mrcal: sudo apt-get install python3-mrcal")
+
+    monkeypatch.setattr("rainstereo.calib.mrcal_versions.load", missing)
+    assert calibrate(boards / "dry", boards / "wet", tmp_path / "rig") == 1
+    told = words(capsys)
+    assert "apt-get install python3-mrcal" in told
+    assert "pairs show the board" not in told
+    assert "report it" not in told
