@@ -237,7 +237,8 @@ class DropStack:
                     behind = float(panel.index)  # optical contact, or no far side
                     continue
                 ahead = float(panel.index) if side == "near" else 1.0
-                face = Face(z + panel.thickness * (side == "far"), behind, ahead, side, origin)
+                here = z + panel.thickness if side == "far" else z  # a far side may be at infinity
+                face = Face(here, behind, ahead, side, origin)
                 there = {j: drop for j, drop in enumerate(drops) if (drop.panel, drop.face) == (i, side)}
                 face.populate(there, len(drops))
                 face.after_drops = any(earlier.drops for earlier in self.faces)

@@ -70,6 +70,11 @@ class Drop(ABC):
         return False
 
     @property
+    def steps(self) -> int | None:
+        """Parallax steps that stand in for the true intersection of ray and surface; None: no such shortcut."""
+        return None
+
+    @property
     @abstractmethod
     def volume(self) -> float:
         """Cubic metres."""

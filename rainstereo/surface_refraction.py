@@ -32,8 +32,7 @@ def leave_far_face(rays: RayBundle, drop: Drop, x: Array, y: Array, n1: float, n
     kz = fresnel.normal_component(rays.kz, n1, n)
     rays.enter(kz, n1, n)
     ux, uy = rays.kx / kz, rays.ky / kz
-    low, high = _bracket(drop, x, y, ux, uy, upwards=True)
-    t = meet(drop, x, y, ux, uy, low, high)
+    t = _height(drop, x, y, ux, uy, upwards=True)
     normal = _normal(drop, x + t * ux, y + t * uy, t)
     along = rays.kx * normal[0] + rays.ky * normal[1] + kz * normal[2]
     turned = fresnel.normal_component(along, n, n2)
@@ -44,7 +43,7 @@ def leave_far_face(rays: RayBundle, drop: Drop, x: Array, y: Array, n1: float, n
     reflected = np.isnan(turned)
     rays.mark(reflected, Fate.TOTAL_REFLECTION)
     rays.mark(~((rays.kz > 0) & (along > 0)) & ~reflected, Fate.SIDEWAYS)
-    if not drop.is_convex:
+    if drop.steps is None and not drop.is_convex:
         vx, vy = rays.kx / rays.kz, rays.ky / rays.kz
         again = _rises_above(drop, x + t * (ux - vx), y + t * (uy - vy), vx, vy, t)
         rays.mark(again, Fate.AIR_SIDE)
@@ -53,6 +52,8 @@ def leave_far_face(rays: RayBundle, drop: Drop, x: Array, y: Array, n1: float, n
 def meets_air_side(drop: Drop, x: Array, y: Array, ux: Array, uy: Array) -> types.Mask:
     """Which rays of slopes ux, uy in the air, through x, y of the face beside a drop, run into its side."""
     meets = np.zeros(len(x), dtype=np.bool_)
+    if drop.steps is not None:
+        return meets
     near = np.hypot(x, y) < drop.reach + drop.top * np.hypot(ux, uy)
     at = np.flatnonzero(near & ~drop.covers(x, y))
     if at.size:
@@ -72,8 +73,7 @@ def enter_near_face(rays: RayBundle, drop: Drop, x: Array, y: Array, n1: float, 
     """
     n = drop.index
     ux, uy = -rays.kx / rays.kz, -rays.ky / rays.kz  # along the ray, seen from the face towards the camera
-    low, high = _bracket(drop, x, y, ux, uy, upwards=False)
-    t = meet(drop, x, y, ux, uy, low, high)
+    t = _height(drop, x, y, ux, uy, upwards=False)
     nx, ny, nz = _normal(drop, x + t * ux, y + t * uy, t)
     along = -(rays.kx * nx + rays.ky * ny - rays.kz * nz)
     turned = fresnel.normal_component(along, n1, n)
@@ -84,7 +84,7 @@ def enter_near_face(rays: RayBundle, drop: Drop, x: Array, y: Array, n1: float, 
     move_x, move_y = t * ux + step * kx, t * uy + step * ky
     rays.x, rays.y, rays.rise = rays.x + move_x, rays.y + move_y, 0.0
     dry = ~((kz > 0) & (along > 0) & drop.covers(x + move_x, y + move_y))
-    if not drop.is_convex:
+    if drop.steps is None and not drop.is_convex:
         for share in np.linspace(0, 1, SAMPLES, endpoint=False)[1:]:
             way = share * step
             level = drop.level(x + t * ux + way * kx, y + t * uy + way * ky, (1 - share) * t)[0]
@@ -103,6 +103,17 @@ def _normal(drop: Drop, x: Array, y: Array, z: Array) -> tuple[Array, Array, Arr
     _, gx, gy, gz = drop.level(x, y, z)
     length = np.sqrt(gx * gx + gy * gy + gz * gz)
     return -gx / length, -gy / length, -gz / length
+
+
+def _height(drop: Drop, x: Array, y: Array, ux: Array, uy: Array, *, upwards: bool) -> Array:
+    """Height at which each ray meets the surface, truly or after the drop's number of steps."""
+    if drop.steps is None:
+        low, high = _bracket(drop, x, y, ux, uy, upwards=upwards)
+        return meet(drop, x, y, ux, uy, low, high)
+    t = np.zeros_like(x)
+    for _ in range(drop.steps):
+        t = np.maximum(t + drop.level(x + t * ux, y + t * uy, t)[0], 0)
+    return t
 
 
 def _bracket(drop: Drop, x: Array, y: Array, ux: Array, uy: Array, *, upwards: bool) -> tuple[Array, Array]:

@@ -137,6 +137,57 @@ def test_single_precision(tilt: float, face: str, rng: np.random.Generator) -> N
         assert np.count_nonzero(single.status != double.status) <= 2  # at an edge or the critical angle
 
 
+@pytest.mark.parametrize("face", ["far", "near"])
+@pytest.mark.parametrize("tilt", [0, 15, 30, 45])
+@pytest.mark.parametrize("panels", [1, 2])
+def test_single_precision_at_every_pixel(face: str, tilt: float, panels: int, rng: np.random.Generator) -> None:
+    """Whole windows, one or two panels, contact angles up to 60 degrees, a scene at half a metre and at infinity."""
+    make = pane if panels == 1 else two_panels
+    for _ in range(12):
+        chamber, angle = make(tilt, rng.uniform(0, 360)), rng.choice([5, 20, 40, 50, 60])
+        drop = cap(angle, face, panels - 1, 10 ** rng.uniform(-4.3, -2.1), centre=tuple(rng.uniform(-0.015, 0.015, 2)))
+        pixels = window(drop, chamber, rng, 4000).astype(np.float32)
+        for depth in (0.5, math.inf):
+            single, double = (trace(p, drop, CAMERA, chamber, depth) for p in (pixels, pixels.astype(np.float64)))
+            compare = in_frame(single) & in_frame(double)
+            assert np.abs(single.source - double.source)[compare].max(initial=0) <= 0.02
+
+
+def test_single_precision_next_to_total_reflection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rays that barely leave are traced in double precision; in single they would turn by too much."""
+    chamber, drop = pane(45, 180), cap(20, radius=3e-3, centre=(0.01, 0.008))
+    frame = PanelFrame.of(chamber)
+    middle = project(frame.to_camera(frame.base(chamber, drop.centre, 0, "far"))[None], CAMERA, chamber)[0][0]
+    pixels = middle + np.stack(np.meshgrid(np.arange(-65, 65, 0.2), np.arange(-65, 65, 0.2)), -1)
+    pixels = pixels.astype(np.float32)
+    exact = trace(pixels.astype(np.float64), drop, CAMERA, chamber, 5.0)
+    errors = []
+    for grazing in (0.1, 0.0):
+        monkeypatch.setattr("rainstereo.trace.GRAZING", grazing)
+        single = trace(pixels, drop, CAMERA, chamber, 5.0)
+        compare = in_frame(single) & in_frame(exact)
+        errors.append(np.abs(single.source - exact.source)[compare].max())
+    assert exact.transmittance[in_frame(exact)].min() < 0.05
+    assert errors[0] <= 0.02 < errors[1]
+
+
+@pytest.mark.parametrize("face", ["far", "near"])
+def test_the_source_is_linear_in_inverse_depth(face: str) -> None:
+    """(x_r(Z) - x_r(inf)) Z is one constant, to 1e-9, also in the reference, which does not know of it."""
+    chamber, drop = two_panels(20, 70), cap(45, face, 1, centre=(0.002, -0.001))
+    frame, scene = PanelFrame.of(chamber), reference_scene(drop, chamber)
+    middle = project(frame.to_camera(frame.base(chamber, drop.centre, 1, face))[None], CAMERA, chamber)[0]
+    pixels = middle + np.array([[0.0, 0.0], [5.0, -3.0], [-4.0, 4.0]])
+    t = trace(pixels, drop, CAMERA, chamber)
+    assert (t.status == 0).all()
+    for pixel, slope in zip(pixels, t.slope, strict=True):
+        far = march(scene, pixel, mp.inf)[0]
+        for depth in (0.2, 1.0, 7.0, 300.0):
+            near = march(scene, pixel, mp.mpf(depth))[0]
+            constant = [float((a - b) * depth) for a, b in zip(near, far, strict=True)]
+            np.testing.assert_allclose(slope, constant, rtol=1e-9)
+
+
 def test_one_trace_serves_every_depth(rng: np.random.Generator) -> None:
     drop, chamber = cap(50, centre=(0.004, 0.001)), two_panels(20)
     pixels = window(drop, chamber, rng, 300)
@@ -272,7 +323,12 @@ def test_water_behind_a_window(rng: np.random.Generator) -> None:
     pixels = window(drop, tank, rng, 200)
     t = trace(pixels, drop, CAMERA, tank, 0.5)
     assert (t.status == 0).sum() > 80
+    assert np.isfinite(t.source[t.status == 0]).all()
     # through a metre of water, seen by the path inside it: points at 0.5 m are in the water in both
     assert np.isfinite(trace(pixels, drop, CAMERA, thick, 5.0).source[t.status == 0]).any()
     apart = trace(pixels, drop, CAMERA, tank).source - t.source
     np.testing.assert_allclose(apart[t.status == 0] * 0.5, -t.slope[t.status == 0], rtol=1e-9, atol=1e-9)
+    rays = backproject(pixels, CAMERA, tank)
+    points = rays.origins + rays.directions * ((0.5 - rays.origins[:, 2]) / rays.directions[:, 2])[:, None]
+    bare = trace(pixels, None, CAMERA, tank, 0.5)
+    np.testing.assert_allclose(bare.source, CAMERA.project(points), rtol=0, atol=1e-10)
