@@ -94,7 +94,7 @@ class Texture:
     transmittance: (H, W) share of light that passes the whole path; float32, or uint8 in 255ths.
     fate: (H, W) `Fate` of each texel; the mask A is where it is 0.
     origin: (x, y) of the first texel's pixel.
-    start: metres, greatest z at which a ray leaves the chamber; planes before it have no answer.
+    start: (H, W) metres, z at which the texel's ray leaves the chamber; planes before it have no answer.
     depth: metres, the only one that the texture is right for; None: it serves every depth.
     scale: of a literal texture, pixels for each metre of thickness, or pixels where thickness is constant.
 
@@ -106,7 +106,7 @@ class Texture:
     transmittance: Array
     fate: types.Status
     origin: tuple[float, float]
-    start: float
+    start: Array
     depth: float | None = None
     scale: float | None = None
 
@@ -191,7 +191,7 @@ class Texture:
             Channels.of(_spread(offset, seen, window)),
             Channels.of(_spread(t.slope[seen], seen, window)) if depth is None else None,
             np.clip(_spread(t.transmittance[seen], seen, window), 0, 1), t.fate.reshape(_shape(window)),
-            (window[1].start, window[0].start), t.last_start, depth,
+            (window[1].start, window[0].start), _spread(t.start[seen], seen, window), depth,
         )  # fmt: skip
         return texture if bits is None else texture.quantized()
 
@@ -203,7 +203,8 @@ class Texture:
         fate = np.where(thin.wet, Fate.THROUGH, Fate.NO_DROP).astype(np.uint8).reshape(_shape(window))
         light = _spread(thin.bare.transmittance, thin.wet, window)
         origin = (window[1].start, window[0].start)
-        return cls(offset, slope, light, fate, origin, thin.bare.last_start, depth, scale)
+        start = _spread(thin.bare.start, thin.wet, window)
+        return cls(offset, slope, light, fate, origin, start, depth, scale)
 
     def quantized(self) -> Texture:
         """The same texture in eight bits a channel; the scales of the magnitudes stay floating point."""
@@ -246,9 +247,10 @@ class Texture:
         values[~seen] = np.nan
         values = values.astype(flat.dtype, copy=False)
         offset, slope = (ideal + values[:, :2]).reshape(*shape, 2), values[:, 2:4].reshape(*shape, 2)
-        start = np.where(seen, flat.dtype.type(self.start), np.nan).astype(flat.dtype).reshape(shape)
+        near = self.start.ravel().take(index) if seen.any() else np.zeros(len(flat))
+        start = np.where(seen, near, np.nan).astype(flat.dtype).reshape(shape)
         light, fate = values[:, 4].reshape(shape), fate.reshape(shape)
-        return Trace(offset, light, fate, offset, slope, start, np.inf, camera, fate, self.start).at(depth)
+        return Trace(offset, light, fate, offset, slope, start, np.inf, camera, fate, float(near.max(initial=0.0))).at(depth)
 
     def _nearest(self, x: Array, y: Array) -> tuple[types.Status, types.Indices]:
         """Fate, (N,), and number of the texel nearest to places on the texture, (N,) each; NO_DROP beyond it."""
