@@ -10,6 +10,7 @@ from .types import Array, Indices
 NOBODY = -1
 """The number of no drop."""
 CELLS = 256  # along each side, at most
+ROUNDING = 1e-5  # of the reach: single precision must not lose a ray at the rim
 
 
 class DropGrid:
@@ -17,8 +18,10 @@ class DropGrid:
 
     A ray belongs to the drop in whose circle (of radius `reach`) its point of the face lies deepest: the one of
     smallest d^2 - reach^2, d the distance from the centre. So circles that overlap part along their common chord, and
-    the order of the drops does not matter. Beside all circles it belongs, within `margin` heights, to the drop it is
-    closest to in the same sense.
+    the order of the drops does not matter. Beside all circles it belongs to the one it is closest to, in the same
+    sense, of those that it can meet: that stand no farther away than it moves along the face over their height.
+
+    margin: greatest slope, against the normal, of the rays that will ask.
     """
 
     def __init__(self, drops: dict[int, Drop], origin: Array, margin: float) -> None:
@@ -26,8 +29,9 @@ class DropGrid:
         self.numbers = np.array([*drops, NOBODY])
         centres = np.array([origin[:2] + np.asarray(drop.centre) for drop in drops.values()])
         reach = np.array([drop.reach for drop in drops.values()])
-        wide = reach + margin * np.array([drop.top for drop in drops.values()])
-        self.table = np.concatenate([centres.T, [reach**2], [wide**2]])
+        top = np.array([drop.top for drop in drops.values()])
+        wide = reach + margin * top
+        self.table = np.concatenate([centres.T, [reach], [top]])
         self.low = (centres - wide[:, None]).min(0)
         extent = (centres + wide[:, None]).max(0) - self.low
         self.cell = max(float(np.median(wide)), float(extent.max()) / CELLS)
@@ -50,8 +54,11 @@ class DropGrid:
         table[layer, cell] = row
         return table
 
-    def whose(self, x: Array, y: Array) -> Indices:
-        """Number of the drop that the ray through each point of the face, (N,), may meet; `NOBODY` if none."""
+    def whose(self, x: Array, y: Array, slope: Array) -> Indices:
+        """Number of the drop that the ray through each point of the face, (N,), may meet; `NOBODY` if none.
+
+        slope: (N,) of the rays in the air, against the normal.
+        """
         # single precision will do: whether the ray then meets its drop is decided elsewhere, in full
         x, y = x.astype(np.float32), y.astype(np.float32)
         u, v = (x - float(self.low[0])) / self.cell, (y - float(self.low[1])) / self.cell
@@ -59,7 +66,7 @@ class DropGrid:
         cell = np.where(inside, np.floor(v) * self.size[0] + np.floor(u), len(self.candidates[0]) - 1).astype(np.intp)
         owner = np.full(len(x), NOBODY)
         best = np.full(len(x), np.inf, dtype=x.dtype)
-        cx, cy, square, wide = self.table.astype(x.dtype)
+        cx, cy, reach, top = self.table.astype(x.dtype)
         for layer in self.candidates:
             row = layer[cell]
             at = np.flatnonzero(row >= 0)
@@ -68,8 +75,11 @@ class DropGrid:
             row = row[at]
             dx, dy = x[at] - cx[row], y[at] - cy[row]
             d2 = dx * dx + dy * dy
-            depth = d2 - square[row]
-            closer = (depth < best[at]) & (d2 < wide[row])
+            near = reach[row]
+            depth = d2 - near * near
+            near += slope[at] * top[row]
+            near *= 1 + ROUNDING
+            closer = (depth < best[at]) & (d2 < near * near)
             at = at[closer]
             best[at] = depth[closer]
             owner[at] = row[closer]

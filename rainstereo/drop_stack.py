@@ -103,13 +103,13 @@ class Face:
 
     def _whose(self, rays: RayBundle) -> types.Indices:
         """The drop that each ray may meet, judged by where it crosses the plane."""
-        slope = 0.0
         # of the rays on the air side of the face; one that cannot pass the bare face counts as steepest
-        kz2 = np.fmin.reduce(rays.kz * rays.kz / rays.scale, initial=self.n1**2) + (1 - self.n1**2)
-        slope = math.sqrt(1 / kz2 - 1) if 0 < kz2 < 1 else 0.0 if kz2 >= 1 else STEEPEST
-        if self.grid is None or self.grid.margin < min(slope, STEEPEST):
-            self.grid = DropGrid(self.drops, self.origin, min(1.5 * slope, STEEPEST))
-        return self.grid.whose(rays.x, rays.y)
+        kz2 = (rays.kz * rays.kz / rays.scale + (1 - self.n1**2)).astype(np.float32)
+        slope = np.sqrt(1 / np.clip(kz2, 1 / (1 + STEEPEST**2), 1) - 1)
+        steepest = float(np.fmax.reduce(slope, initial=0.0))
+        if self.grid is None or self.grid.margin < steepest:
+            self.grid = DropGrid(self.drops, self.origin, min(1.5 * steepest, STEEPEST))
+        return self.grid.whose(rays.x, rays.y, slope)
 
 
 class CapGroup:

@@ -250,7 +250,8 @@ class Texture:
         near = self.start.ravel().take(index) if seen.any() else np.zeros(len(flat))
         start = np.where(seen, near, np.nan).astype(flat.dtype).reshape(shape)
         light, fate = values[:, 4].reshape(shape), fate.reshape(shape)
-        return Trace(offset, light, fate, offset, slope, start, np.inf, camera, fate, float(near.max(initial=0.0))).at(depth)
+        last = float(near.max(initial=0.0))
+        return Trace(offset, light, fate, offset, slope, start, np.inf, camera, fate, last).at(depth)
 
     def _nearest(self, x: Array, y: Array) -> tuple[types.Status, types.Indices]:
         """Fate, (N,), and number of the texel nearest to places on the texture, (N,) each; NO_DROP beyond it."""

@@ -195,6 +195,7 @@ class _Plan:
         scale += kz * kz
         rays = RayBundle(x, y, kx, ky, kz, z, 1.0, np.zeros(len(kx), dtype=np.uint8), scale, given.dtype)
         good = kz > 0 if self.stack.faces else np.isfinite(kz)
+        good &= np.isfinite(scale)
         if isinstance(z, np.ndarray):
             good &= z < self.stack.faces[0].z if self.stack.faces else np.isfinite(z)
         if not good.all():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rainstereo import Camera, Chamber, Panel
+from rainstereo.drop_grid import DropGrid
 from rainstereo.droplet import SphericalCap
 from rainstereo.panel_plane import PanelFrame
 from rainstereo.refraction import backproject, project
@@ -332,3 +333,38 @@ def test_water_behind_a_window(rng: np.random.Generator) -> None:
     points = rays.origins + rays.directions * ((0.5 - rays.origins[:, 2]) / rays.directions[:, 2])[:, None]
     bare = trace(pixels, None, CAMERA, tank, 0.5)
     np.testing.assert_allclose(bare.source, CAMERA.project(points), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("pane", [None, Chamber((0, 0, 1), 0.05, (Panel(0.003, 1.49),))])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_pixels_that_are_no_numbers_have_no_answer(pane: Chamber | None, bad: float) -> None:
+    """Also where panels stand square to the camera and the other coordinate would suffice."""
+    pixels = np.array([[bad, 1.0], [1.0, bad], [640.0, 480.0]])
+    t = trace(pixels, None, CAMERA, pane)
+    assert t.status.tolist() == [Fate.NOT_FINITE, Fate.NOT_FINITE, Fate.THROUGH]
+    assert np.isnan(t.source[:2]).all()
+
+
+@pytest.mark.parametrize("margin", [0.0, 1.0, 12.0])
+def test_whose_a_ray_is(rng: np.random.Generator, margin: float) -> None:
+    """Of the drops that a slanting ray can meet, the one in whose circle it crosses the face deepest."""
+    drops = {
+        10 + i: SphericalCap((float(x), float(y)), float(radius), float(angle), face="near")
+        for i, (x, y, radius, angle) in enumerate(
+            rng.uniform([-0.01, -0.01, 2e-4, 0.05], [0.01, 0.01, 3e-3, 1.5], (60, 4))
+        )
+    }
+    grid = DropGrid(drops, np.zeros(3), margin)
+    x, y = rng.uniform(-0.015, 0.015, (2, 5000))
+    slope = rng.uniform(0, margin, 5000)
+    centres = np.array([drop.centre for drop in drops.values()])
+    reach, top = (np.array([getattr(drop, name) for drop in drops.values()]) for name in ("reach", "top"))
+    d = np.hypot(x[:, None] - centres[:, 0], y[:, None] - centres[:, 1])
+    depth = np.where(d < reach + slope[:, None] * top, d**2 - reach**2, np.inf)
+    expected = np.where(np.isfinite(depth.min(1)), np.array(list(drops))[depth.argmin(1)], -1)
+    two = np.sort(depth, 1)[:, :2]
+    with np.errstate(invalid="ignore"):
+        close = (two[:, 1] - two[:, 0] < 1e-10) | (np.abs(d - reach - slope[:, None] * top) < 1e-6).any(1)
+    found = grid.whose(x, y, slope)
+    assert (found >= 0).mean() > 0.3
+    np.testing.assert_array_equal(found[~close], expected[~close])
