@@ -119,13 +119,23 @@ class BezierDrop(Drop):
         return (1 - t) * self._handles[1] + t * self._handles[3]
 
     @cached_property
-    def is_convex(self) -> bool:
-        """Whether no part of the surface lies before the tangent plane of another."""
+    def _lattice(self) -> tuple[Array, ...]:
+        """x, y, height and slopes on half a disc to one side of the downhill line."""
         r, phi = np.meshgrid(np.linspace(0, 0.999, 16), np.linspace(-math.pi / 2, math.pi / 2, 25))
         x, y = (self.radius * r * np.cos(phi)).ravel(), (self.radius * r * np.sin(phi)).ravel()
         c, s = self.downhill
-        x, y = y * c + x * s, y * s - x * c  # half a disc to one side of the downhill line
-        z, sx, sy = self.surface(x, y)
+        x, y = y * c + x * s, y * s - x * c
+        return x, y, *self.surface(x, y)
+
+    @cached_property
+    def steepest(self) -> float:
+        """A tenth more than the greatest slope on a lattice."""
+        return 1.1 * float(np.hypot(*self._lattice[3:]).max())
+
+    @cached_property
+    def is_convex(self) -> bool:
+        """Whether no part of the surface lies before the tangent plane of another."""
+        x, y, z, sx, sy = self._lattice
         points, normals = np.stack([x, y, z], -1), np.stack([-sx, -sy, np.ones_like(z)], -1)
         return is_convex_hull(points, normals, 1e-9 * self.radius)
 

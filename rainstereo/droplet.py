@@ -75,6 +75,14 @@ class Drop(ABC):
         return None
 
     @property
+    def steepest(self) -> float:
+        """A slope against the face that the surface nowhere exceeds: rays closer to the normal cross it only once.
+
+        inf if it is not known, which is never wrong but slow.
+        """
+        return math.inf
+
+    @property
     @abstractmethod
     def volume(self) -> float:
         """Cubic metres."""

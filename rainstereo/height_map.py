@@ -121,6 +121,14 @@ class HeightMap(Drop):
         return float(self.heights.max()) * (1.25 if self.interpolation == "bicubic" else 1.001)
 
     @cached_property
+    def steepest(self) -> float:
+        """A tenth more than the greatest slope on a lattice of 5 x 5 in each wet cell."""
+        cells = np.flatnonzero(self._wet_cells)
+        places = [np.full(len(cells), share) for share in np.linspace(0, 1, 5)]
+        slopes = [np.hypot(*self._polynomials(u, v, cells)[1:]) for u in places for v in places]
+        return 1.1 * float(np.max(slopes))
+
+    @cached_property
     def volume(self) -> float:
         """Cubic metres: the sum of the wet heights, as the trapezoidal rule has it."""
         return float(np.maximum(self.heights, 0).sum()) * self.spacing**2

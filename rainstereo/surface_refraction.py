@@ -3,7 +3,9 @@
 A drop is known by a level function, positive in the water (`Drop.level`; height of the surface minus height, for one).
 Along a ray, take the height t above the face as the parameter: the ray meets the surface where g(t) = level(p + t u, t)
 changes sign, u being the ray's slope. Newton's method kept in a bracket finds that to rounding. From within a convex
-drop there is one such place; on others the bracket is found first, by samples along the ray.
+drop there is one such place; on others the bracket is found first, by samples along the ray. Gentle rays are spared
+that: one that moves along the face by less than a height over the surface's greatest slope, for each height it climbs,
+can cross the surface only once, and from outside only where it crosses the wet face.
 """
 
 from __future__ import annotations
@@ -55,7 +57,8 @@ def meets_air_side(drop: Drop, x: Array, y: Array, ux: Array, uy: Array) -> type
     if drop.steps is not None:
         return meets
     near = np.hypot(x, y) < drop.reach + drop.top * np.hypot(ux, uy)
-    at = np.flatnonzero(near & ~drop.covers(x, y))
+    at = np.flatnonzero(near & ~_gentle(drop, ux, uy))
+    at = at[~drop.covers(x[at], y[at])]
     if at.size:
         meets[at] = _deepest(drop, x[at], y[at], ux[at], uy[at])[1] > 0
     return meets
@@ -85,10 +88,12 @@ def enter_near_face(rays: RayBundle, drop: Drop, x: Array, y: Array, n1: float, 
     rays.x, rays.y, rays.rise = rays.x + move_x, rays.y + move_y, 0.0
     dry = ~((kz > 0) & (along > 0) & drop.covers(x + move_x, y + move_y))
     if drop.steps is None and not drop.is_convex:
+        at = np.flatnonzero(~_gentle(drop, kx / kz, ky / kz))
+        px, py, high = (x + t * ux)[at], (y + t * uy)[at], t[at]
         for share in np.linspace(0, 1, SAMPLES, endpoint=False)[1:]:
-            way = share * step
-            level = drop.level(x + t * ux + way * kx, y + t * uy + way * ky, (1 - share) * t)[0]
-            dry |= level < -SLACK * drop.top
+            way = share * step[at]
+            level = drop.level(px + way * kx[at], py + way * ky[at], (1 - share) * high)[0]
+            dry[at] |= level < -SLACK * drop.top
     rays.kx, rays.ky, rays.kz = kx, ky, kz
     reflected = np.isnan(turned)
     behind = fresnel.normal_component(kz, n, n2)
@@ -130,6 +135,15 @@ def _bracket(drop: Drop, x: Array, y: Array, ux: Array, uy: Array, *, upwards: b
         low[at] = np.where(level > 0, t, np.nan)
     if drop.is_convex:
         return low, high
+    at = np.flatnonzero(~_gentle(drop, ux, uy))
+    low[at], high[at] = _first_change(drop, x[at], y[at], ux[at], uy[at], low[at], high[at], upwards=upwards)
+    return low, high
+
+
+def _first_change(
+    drop: Drop, x: Array, y: Array, ux: Array, uy: Array, low: Array, high: Array, *, upwards: bool
+) -> tuple[Array, Array]:
+    """A bracket narrowed, by samples, to the first crossing of several."""
     found = np.zeros(len(x), dtype=np.bool_)
     for t in _heights(drop) if upwards else _heights(drop)[::-1]:
         inside = drop.level(x + t * ux, y + t * uy, np.full_like(x, t))[0] > 0
@@ -140,6 +154,11 @@ def _bracket(drop: Drop, x: Array, y: Array, ux: Array, uy: Array, *, upwards: b
         else:
             found |= inside
     return low, high
+
+
+def _gentle(drop: Drop, ux: Array, uy: Array) -> types.Mask:
+    """Which rays of these slopes cross the drop's surface once at most."""
+    return np.asarray((ux * ux + uy * uy) * (drop.steepest * drop.steepest) < 1)
 
 
 def _heights(drop: Drop) -> Array:
@@ -194,7 +213,7 @@ def _rises_above(drop: Drop, x: Array, y: Array, ux: Array, uy: Array, start: Ar
     """Which rays in the air, through x, y of the face, pass under the surface above the height `start`."""
     under = np.zeros(len(x), dtype=np.bool_)
     near = np.hypot(x, y) < drop.reach + drop.top * np.hypot(ux, uy)
-    at = np.flatnonzero(near)
+    at = np.flatnonzero(near & ~_gentle(drop, ux, uy))
     if not at.size:
         return under
     x, y, ux, uy = x[at], y[at], ux[at], uy[at]

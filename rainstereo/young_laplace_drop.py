@@ -124,6 +124,13 @@ class YoungLaplaceDrop(Drop):
         gradient = np.stack(self.shape.level(*self._points.T)[1:], -1)
         return is_convex_hull(self._points, -gradient, 1e-9)
 
+    @cached_property
+    def steepest(self) -> float:
+        """A twentieth more than the greatest slope on a lattice that has the contact line."""
+        _, gx, gy, gz = self.shape.level(*self._points.T)
+        with np.errstate(divide="ignore"):
+            return 1.05 * float((np.hypot(gx, gy) / np.abs(gz)).max())
+
     @property
     def reach(self) -> float:
         """The contact radius, metres."""
