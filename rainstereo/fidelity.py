@@ -38,6 +38,8 @@ GRAY_PROBES, BLURRED_PROBES = 64, 24
 SUBPIXELS = 6  # along each side of a pixel, of what stands for its whole area
 FLOOR = 1 / 16  # of a square that an extrapolation may leave
 RING = np.stack([np.cos(np.arange(8) * math.pi / 4), np.sin(np.arange(8) * math.pi / 4)], -1)  # a pixel around
+LAYER_SHARES = 0.014, 0.075
+"""Of the image's standard deviation, RMS: what the resolution of `defocus` costs, and that times the disc's pixels."""
 CELLS = 1_000_000  # of the tables of distances that are held at once
 
 COST_OF_A_RAY = {
@@ -269,8 +271,14 @@ class _GrayLevels:
             tier.method is Method.LAYER
         ):  # points too few tell as the inverse of their number: half of them, twice as much
             half = upper(self._squares(found.every_other(), self.truth.every_other()))
-            whole = max(2 * whole - half, FLOOR * whole)
+            whole = max(2 * whole - half, FLOOR * whole) + self._of_resolution(self.lens)
         return math.sqrt(whole)
+
+    def _of_resolution(self, lens: ThinLens) -> float:
+        """Square of what a layer loses to the few samples that `defocus` spends on a disc, as measured."""
+        diameter = max(tiers.disc(lens, self.drop, self.camera, self.chamber), 1.0)
+        share = LAYER_SHARES[0] + LAYER_SHARES[1] / diameter
+        return float(self.scene.at(np.array(0.0))) * share**2
 
     def _squares(self, one: Sampling, other: Sampling) -> Array:
         places = np.concatenate([one.places, other.places], 1)

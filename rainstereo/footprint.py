@@ -15,7 +15,6 @@ from .types import Array
 
 AROUND = 64
 HEIGHTS = 5
-STEP = 1e-6  # metres
 
 
 def outline(drop: Drop, camera: Camera, chamber: Chamber) -> Array:
@@ -48,15 +47,3 @@ def window(drop: Drop, camera: Camera, chamber: Chamber, margin: float = 0.0) ->
     first = np.clip(np.floor(low), 0, camera.size).astype(int)
     last = np.clip(np.ceil(high) + 1, first, camera.size).astype(int)
     return slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))
-
-
-def magnification(drop: Drop, camera: Camera, chamber: Chamber) -> Array:
-    """Pixels a metre, (2,), at which the camera sees things across its axis, along x and y, where the drop stands.
-
-    f / z without a chamber; the panels before the drop bring it closer. NaN where the drop's centre has no image.
-    """
-    frame = PanelFrame.of(chamber)
-    centre = frame.to_camera(frame.base(chamber, drop.centre, drop.panel, drop.face))
-    steps = STEP * np.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]])
-    pixels, _ = project(centre + steps, camera, chamber)
-    return np.array([pixels[1, 0] - pixels[0, 0], pixels[3, 1] - pixels[2, 1]]) / (2 * STEP)

@@ -16,8 +16,8 @@ import numpy as np
 
 from .camera import Camera
 from .chamber import Chamber
+from .defocus import apparent_distance, middles, parts_of
 from .droplet import Drop, SphericalCap, cap_angle
-from .footprint import magnification
 from .height_map import HeightMap
 from .texture import Texture
 from .thin_lens import ThinLens
@@ -192,7 +192,21 @@ def sampling(
         origins, directions = lens.rays(pixels, camera, lens.points(tier.count) @ turned)
         seen = trace_rays(origins.swapaxes(0, 1), directions.swapaxes(0, 1), drop, camera, chamber, depth)
         return Sampling.of(seen, pixels, clear)
-    return Sampling.of(look(pixels[:, None] + shifts(lens, drop, camera, chamber, LAYER_POINTS)), pixels, clear)
+    return _layer(look, pixels, drop, camera, chamber, lens, clear)
+
+
+def _layer(
+    look: Tracer, pixels: Array, drop: Drop, camera: Camera, chamber: Chamber, lens: ThinLens, clear: Array
+) -> Sampling:
+    """Points of the disc, each of which sees the scene as far aside as the middle of its part of the disc asks."""
+    disc = shifts(lens, drop, camera, chamber, LAYER_POINTS)
+    distance = apparent_distance(drop, chamber)
+    parts = middles(parts_of(lens.blur(distance, camera)))  # of a disc of diameter 1
+    unit = lens.points(LAYER_POINTS) / (2 * lens.aperture)
+    nearest = np.argmin(np.square(unit[:, None] - parts).sum(-1), axis=1)
+    aside = parts[nearest] * (2 * lens.aperture / distance) * camera.intrinsics[:2]
+    seen = look(pixels[:, None] + disc)
+    return Sampling.of(replace(seen, source=seen.source - aside), pixels, clear)
 
 
 LAYER_POINTS = 256
@@ -207,18 +221,14 @@ def subpixels(side: int) -> Array:
 
 def disc(lens: ThinLens, drop: Drop, camera: Camera, chamber: Chamber) -> float:
     """Diameter in pixels of the disc that a point of the drop's face becomes; 0 for a pinhole."""
-    return 2 * lens.aperture * float(np.abs(_defocus(lens, drop, camera, chamber)).mean())
+    return lens.blur(apparent_distance(drop, chamber), camera)
 
 
 def shifts(lens: ThinLens, drop: Drop, camera: Camera, chamber: Chamber, count: int) -> Array:
     """From a pixel to those that see, through the aperture's centre, what `count` points of it see: (count, 2) pixels.
 
-    The ray of the pixel at image distance s from point a meets the drop's face where the central ray of
-    s + a (m - f / focus) does, m being the face's magnification in pixels a metre.
+    The ray of the pixel at image distance s from point a meets the drop's face, at distance d, where the central ray of
+    s + f a (1 / d - 1 / focus) does.
     """
-    return lens.points(count) * _defocus(lens, drop, camera, chamber)
-
-
-def _defocus(lens: ThinLens, drop: Drop, camera: Camera, chamber: Chamber) -> Array:
-    """Pixels, (2,), for each metre in the aperture."""
-    return magnification(drop, camera, chamber) - camera.intrinsics[:2] / lens.focus
+    defocus = 1 / apparent_distance(drop, chamber) - 1 / lens.focus
+    return np.asarray(lens.points(count) * (defocus * camera.intrinsics[:2]))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from skimage import data
 
 from rainstereo import Camera, Chamber, Panel, footprint
+from rainstereo.defocus import defocused
 from rainstereo.droplet import Drop, SphericalCap
 from rainstereo.fidelity import SAFETY, bounds, choose_tier, cost, displacement_error
 from rainstereo.height_map import HeightMap
@@ -115,8 +116,8 @@ def test_bounds_of_defocus_hold(radius: float, angle: float, f_number: float) ->
     scene = SceneStatistics.of(photograph())
     ladder = [Tier(Method.LAYER), Tier(Method.APERTURE, 64)]
     layer, aperture = bounds(drop, CAMERA, PANE, lens=lens, scene=scene, ladder=ladder)
-    disc = pixels[:, None] + shifts(lens, drop, CAMERA, PANE, 1500)
-    blurred = values(trace(disc, drop, CAMERA, PANE), pixels, clear)
+    drawn = defocused(drop, CAMERA, PANE, lens).layer(photograph()).over(photograph())
+    blurred = drawn[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
     origins, directions = (a.swapaxes(0, 1) for a in lens.rays(pixels, CAMERA, lens.points(64)))
     few = values(trace_rays(origins, directions, drop, CAMERA, PANE), pixels, clear)
     for bound, image in ((layer, blurred), (aperture, few)):
