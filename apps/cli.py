@@ -40,6 +40,10 @@ COMMANDS: dict[str, Command] = {
         "a recording to undistorted, cropped, aligned pairs",
         "rainstereo align --dry drive/dry --wet drive/wet --rig rig --out aligned",
     ),
+    "droplets": Command(
+        "where simple drop models are good to a pixel, and where not", "rainstereo droplets --out out/droplets"
+    ),
+    "rain": Command("adherent rain on any image", "rainstereo rain drive --out rainy --preset camvid --psnr 16.9"),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 

@@ -267,9 +267,8 @@ class _GrayLevels:
             other = self._sampling(tier, look, self.probes, turn=0.5)
             return math.sqrt(0.5 * upper(self._squares(found, other)))
         whole = upper(self._squares(found, self.truth))
-        if (
-            tier.method is Method.LAYER
-        ):  # points too few tell as the inverse of their number: half of them, twice as much
+        if tier.method is Method.LAYER and self.lens is not None:
+            # what comes of points too few falls as their number rises: half of them have twice as much
             half = upper(self._squares(found.every_other(), self.truth.every_other()))
             whole = max(2 * whole - half, FLOOR * whole) + self._of_resolution(self.lens)
         return math.sqrt(whole)
