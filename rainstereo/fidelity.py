@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,7 +47,8 @@ COST_OF_A_RAY = {
     Method.LITERAL: 0.3, Method.SLOPES: 0.3, Method.BAKED: 0.3, Method.HEIGHTS: 2.0,
     Method.CAP: 1.0, Method.EXACT: 1.0, Method.LAYER: 1.5, Method.APERTURE: 1.2,
 }  # fmt: skip
-"""Time of a ray by each method over that of an exact ray through a cap, in round figures (`rainstereo bench drops`)."""
+"""Time of a ray by each method over that of an exact ray through a cap, in round figures, textures and height maps
+already made (`rainstereo bench drops` has the times with their making)."""
 COST_OF_A_SURFACE = 8.0
 """Time of an exact ray through any other shape, found by iteration, over that through a cap."""
 
@@ -58,7 +60,8 @@ class Bound:
     pixels: RMS error of the displacement in pixels of the clear image, over the drop's pixels that show something by
     both the tier and the exact trace, inside the image. lost: share of the drop's pixels on which the two disagree
     whether they show something, farther than a pixel from where the exact trace changes its mind.
-    gray: RMS error in gray levels over all pixels that the drop touches, rounding to whole ones included.
+    gray: RMS error in gray levels over all pixels that the drop touches, rounding to whole ones included; NaN where a
+    choice by pixels did not ask.
     cost: time of a pixel, in those of an exact ray through a cap. reason: why the tier cannot show the drop, or empty.
     """
 
@@ -117,7 +120,7 @@ def choose_tier(
     judge = _Judge(drop, camera, chamber, depth, lens, scene)
     found = []
     for tier in sorted(ladder, key=lambda tier: cost(tier, drop)):  # the dear ones need judging only if need be
-        found.append(judge.bound(tier))
+        found.append(judge.bound(tier, unit))
         if found[-1].meets(tolerance, unit):
             return Choice(found[-1], True, tuple(found))
     usable = [bound for bound in found if not bound.reason]
@@ -158,22 +161,26 @@ class _Judge:
         self.lens = None if lens is None or math.isinf(lens.f_number) else lens
         self.exact = tiers.tracer(Tier(Method.EXACT), *self.of)
         self.probes = _probes(drop, camera, chamber, 0.0)
-        statistics = SceneStatistics.natural() if scene is None else scene
-        self.gray = _GrayLevels(*self.of, self.lens, statistics)
+        self.scene = scene
 
-    def bound(self, tier: Tier) -> Bound:
+    @cached_property
+    def gray(self) -> _GrayLevels:
+        return _GrayLevels(*self.of, self.lens, SceneStatistics.natural() if self.scene is None else self.scene)
+
+    def bound(self, tier: Tier, unit: str = "gray") -> Bound:
         drop, camera, *_ = self.of
         reason = "a pinhole has no blur" if tier.is_defocused and self.lens is None else tier.suits(drop)
         if reason:
             return Bound(tier, math.inf, 1.0, math.inf, cost(tier, drop), reason)
-        if not len(self.probes) + len(self.gray.probes):
+        levels = unit == "gray"
+        if not len(self.probes) and not (levels and len(self.gray.probes)):
             return Bound(tier, 0.0, 0.0, 0.0, cost(tier, drop))
         look = tiers.tracer(tier, *self.of)
         squares, lost = _displacement(self.probes, look, self.exact, camera)
         pixels = SAFETY * math.sqrt(upper(squares))
         if pixels > 0:
             pixels += RESOLUTION
-        gray = SAFETY * self.gray.error(tier, look) + ROUNDING
+        gray = SAFETY * self.gray.error(tier, look) + ROUNDING if levels else math.nan
         return Bound(tier, pixels, SAFETY * upper(lost), gray, cost(tier, drop))
 
 

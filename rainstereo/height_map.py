@@ -117,16 +117,21 @@ class HeightMap(Drop):
 
     @cached_property
     def top(self) -> float:
-        """More than the greatest height that the interpolation can reach, metres."""
-        return float(self.heights.max()) * (1.25 if self.interpolation == "bicubic" else 1.001)
+        """A little more than the greatest height on a lattice of 5 x 5 in each wet cell, metres."""
+        return 1.01 * max(float(height.max()) for height, _ in self._lattice)
 
     @cached_property
     def steepest(self) -> float:
         """A tenth more than the greatest slope on a lattice of 5 x 5 in each wet cell."""
+        return 1.1 * max(float(slope.max()) for _, slope in self._lattice)
+
+    @cached_property
+    def _lattice(self) -> list[tuple[Array, Array]]:
+        """Heights and slopes at 5 x 5 places of all wet cells, (cells,) each."""
         cells = np.flatnonzero(self._wet_cells)
         places = [np.full(len(cells), share) for share in np.linspace(0, 1, 5)]
-        slopes = [np.hypot(*self._polynomials(u, v, cells)[1:]) for u in places for v in places]
-        return 1.1 * float(np.max(slopes))
+        found = [self._polynomials(u, v, cells) for u in places for v in places]
+        return [(height, np.hypot(along_x, along_y)) for height, along_x, along_y in found]
 
     @cached_property
     def volume(self) -> float:

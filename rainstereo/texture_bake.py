@@ -152,13 +152,13 @@ def _along(k: Array, index: float) -> Array:
 def best_scale(unscaled: Array, exact: Trace, ideal: Array) -> float:
     """The s with which ideal + s * unscaled, (N, 2), comes closest to the exact source in least squares.
 
-    Both in pixels without the lens's distortion. Judged where the exact source lies in the frame; if it does nowhere,
-    then wherever it is known, and 0 if that too is nowhere.
+    Both in pixels without the lens's distortion. Judged where the exact source lies in the frame; if that is less than
+    a tenth of where it is known, at the rim alone, then wherever it is known; 0 if that too is nowhere.
     """
     known = exact.status == 0
     with np.errstate(invalid="ignore"):
         inside = known & ((exact.source >= -0.5) & (exact.source <= np.array(exact.camera.size) - 0.5)).all(-1)
-    use = inside if inside.any() else known
+    use = inside if 10 * np.count_nonzero(inside) >= np.count_nonzero(known) > 0 else known
     shape, goal = unscaled[use], (exact.offset + exact.slope / exact.depth - ideal)[use]
     power = float((shape * shape).sum())
     return float((shape * goal).sum()) / power if power > 0 else 0.0
