@@ -23,7 +23,7 @@ RADIUS_RANGE = (1e-6, 0.1)
 CENTRE_LIMIT = 10.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drop(ABC):
     """A drop of any shape on a face of a panel.
 

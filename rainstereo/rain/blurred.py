@@ -1,0 +1,142 @@
+"""Drops out of focus, layer by layer: those at about one distance share a disc, and the nearer layers lie on top."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from rainstereo.camera import Camera
+from rainstereo.chamber import Chamber
+from rainstereo.defocus import SAME, DefocusedPatch, apparent_distance, defocused
+from rainstereo.droplet import Drop
+from rainstereo.layer import Layer
+from rainstereo.panel_plane import PanelFrame
+from rainstereo.patch import resampled, sample_pixels
+from rainstereo.thin_lens import ThinLens
+from rainstereo.types import Array, Image, Mask
+
+Window = tuple[slice, slice]
+SHARPEST = 1.0  # pixels; drops of smaller discs are rendered as through a pinhole
+
+
+@dataclass(frozen=True, eq=False)
+class BlurredLayer:
+    """Drops of one disc.
+
+    patch: in pixels of the camera's image, cut at its edges when it is made.
+
+    lookup: the same in pixels of the images that are given, which may be wider.
+    """
+
+    drops: tuple[Drop, ...]
+    patch: DefocusedPatch
+    lookup: DefocusedPatch
+    shift: tuple[int, int]
+
+    @classmethod
+    def of(
+        cls,
+        drops: tuple[Drop, ...],
+        camera: Camera,
+        chamber: Chamber,
+        lens: ThinLens,
+        depth: float,
+        size: tuple[int, int],
+        shift: tuple[int, int],
+        border: str,
+    ) -> BlurredLayer:
+        """Trace drops. size: (width, height) of the images that are given; shift: x, y of the camera's in them."""
+        made = defocused(drops, camera, chamber, lens, depth, border=border)
+        if shift == (0, 0) and size == camera.size:
+            return cls(drops, made, made, shift)
+        x, y = shift
+        rows = slice(made.patch.rows.start + y, made.patch.rows.stop + y)
+        columns = slice(made.patch.columns.start + x, made.patch.columns.stop + x)
+        source = made.patch.source + np.array(shift, dtype=np.float32)
+        moved = replace(made.patch, rows=rows, columns=columns, source=source, kept=None)
+        return cls(drops, made, replace(made, patch=moved, size=size), shift)
+
+    def paste(self, scene: Image, out: Image) -> None:
+        """Put the layer over a frame. scene: the clear image, as given."""
+        layer = self.lookup.layer(scene)
+        x, y = self.shift
+        rows = slice(layer.rows.start - y, layer.rows.stop - y)
+        columns = slice(layer.columns.start - x, layer.columns.stop - x)
+        Layer(rows, columns, layer.colour, layer.opacity).paste(out)
+
+    @cached_property
+    def _within(self) -> tuple[Window, Window]:
+        """The window in the frame, and in the patch."""
+        width, height = self.patch.size
+        inner, outer = [], []
+        for part, last in ((self.patch.patch.rows, height), (self.patch.patch.columns, width)):
+            first, end = min(max(part.start, 0), last), min(max(part.stop, 0), last)
+            inner.append(slice(first, end))
+            outer.append(slice(first - part.start, end - part.start))
+        return (inner[0], inner[1]), (outer[0], outer[1])
+
+    @cached_property
+    def opacity(self) -> tuple[slice, slice, Array]:
+        """Rows and columns of the frame, and the opacity there."""
+        width, height = self.patch.size
+        layer = self.patch.layer(np.zeros((height, width), dtype=np.uint8))
+        return layer.rows, layer.columns, layer.opacity
+
+    def _fine(self, values: Array) -> Array:
+        """Values of the patch's samples at the pixels of the frame."""
+        patch, (_, cut) = self.patch.patch, self._within
+        height, width = patch.rows.stop - patch.rows.start, patch.columns.stop - patch.columns.start
+        fine = values if patch.density == 1 else resampled(values.astype(np.float32), patch.density, height, width)
+        return fine[cut]
+
+    @cached_property
+    def displacement(self) -> tuple[slice, slice, Mask, Array]:
+        """Of the pinhole's ray: rows, columns, where a drop covers it, and displacements, NaN in dark rims."""
+        patch, (window, _) = self.patch.patch, self._within
+        if not patch.opacity.size:
+            return *window, np.zeros((0, 0), np.bool_), np.zeros((0, 0, 2), np.float32)
+        lit: Image = ((patch.gain > 0) & (patch.opacity > 0)).astype(np.float32)
+        moved = (patch.source - sample_pixels(patch.rows, patch.columns, patch.density)) * lit[..., None]
+        share, total = self._fine(lit), self._fine(moved)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.where(share[..., None] > 0, total / share[..., None], np.nan)
+        return *window, self._fine(patch.opacity) > 0, mean.astype(np.float32)
+
+    @cached_property
+    def unknown(self) -> tuple[slice, slice, Mask]:
+        """Rows, columns, and where the pinhole's ray looks beyond the images that are given."""
+        window, _ = self._within
+        if not self.patch.patch.opacity.size:
+            return *window, np.zeros((0, 0), np.bool_)
+        unknown: Image = self.lookup.patch.unknown(self.lookup.size).astype(np.float32)
+        return *window, self._fine(unknown) > 0
+
+
+def by_disc(
+    drops: Sequence[Drop], camera: Camera, chamber: Chamber, lens: ThinLens
+) -> tuple[list[Drop], list[tuple[Drop, ...]]]:
+    """Drops that are sharp all the same, and the others in layers of about one disc, the farthest first.
+
+    Drops behind the camera are left out.
+    """
+    drops = [drop for drop in drops if _is_ahead(drop, chamber)]
+    discs = [lens.blur(apparent_distance(drop, chamber), camera) for drop in drops]
+    places = [(drop.panel, drop.face == "far") for drop in drops]
+    sharp = [drop for drop, disc in zip(drops, discs, strict=True) if disc < SHARPEST]
+    order = sorted((i for i, disc in enumerate(discs) if disc >= SHARPEST), key=lambda i: (places[i], discs[i]))
+    layers: list[list[int]] = []
+    for i in order:
+        first = layers[-1][0] if layers else i
+        if layers and places[first] == places[i] and discs[i] <= SAME * discs[first]:
+            layers[-1].append(i)
+        else:
+            layers.append([i])
+    return sharp, [tuple(drops[i] for i in sorted(layer)) for layer in reversed(layers)]
+
+
+def _is_ahead(drop: Drop, chamber: Chamber) -> bool:
+    frame = PanelFrame.of(chamber)
+    return bool(frame.to_camera(frame.base(chamber, drop.centre, drop.panel, drop.face))[2] > 0)

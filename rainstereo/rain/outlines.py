@@ -1,0 +1,116 @@
+"""Where in the image many drops are: the circles that enclose them, which of these meet, and the pixels inside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rainstereo.camera import Camera
+from rainstereo.chamber import Chamber
+from rainstereo.droplet import Drop
+from rainstereo.panel_plane import PanelFrame
+from rainstereo.refraction import project
+from rainstereo.types import Array, Indices
+
+from .contacts import clusters, touching
+
+AROUND = 24
+HEIGHTS = 3
+MARGIN = 2.5
+"""Pixels around a drop that are its own too: a ring without any of it, so that two groups share no pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Circles in the image, (N,) each in pixels, that enclose drops and `MARGIN` around them.
+
+    radius: 0 for a drop that the image does not show; infinite where a part of a drop has no image.
+    """
+
+    x: Array
+    y: Array
+    radius: Array
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> Outlines:
+        """The circles of drops, as a pinhole at the camera's centre sees them."""
+        if not drops:
+            nowhere = np.zeros(0)
+            return cls(nowhere, nowhere, nowhere, camera.size)
+        frame = PanelFrame.of(chamber)
+        phi = np.linspace(0, 2 * math.pi, AROUND, endpoint=False)
+        ring = np.stack([np.cos(phi), np.sin(phi)], -1) / math.cos(math.pi / AROUND)  # encloses the circle
+        bases = _bases(drops, frame, chamber)
+        reach, top = (np.array([getattr(drop, name) for drop in drops]) for name in ("reach", "top"))
+        top *= [1 if drop.face == "far" else -1 for drop in drops]
+        points = np.broadcast_to(bases[:, None, None], (len(drops), HEIGHTS, AROUND, 3)).copy()
+        points[..., :2] += reach[:, None, None, None] * ring
+        points[..., 2] += (top[:, None] * np.linspace(0, 1, HEIGHTS))[..., None]
+        pixels = project(frame.to_camera(points.reshape(-1, 3)), camera, chamber)[0].reshape(len(drops), -1, 2)
+        low, high = pixels.min(1), pixels.max(1)
+        middle = 0.5 * (low + high)
+        radius = np.hypot(*np.moveaxis(pixels - middle[:, None], -1, 0)).max(1) + MARGIN
+        seen = np.isfinite(radius)
+        size = np.array(camera.size)
+        middle = np.where(seen[:, None], middle, size / 2)
+        radius = np.where(seen, radius, np.inf)
+        off = np.hypot(*(middle - np.clip(middle, -0.5, size - 0.5)).T)
+        return cls(middle[:, 0], middle[:, 1], np.where(off < radius, radius, 0.0), camera.size)
+
+    def groups(self) -> list[Indices]:
+        """Numbers of the drops that must be traced together: of each chain of circles that meet; none of the unseen."""
+        shown = np.flatnonzero(self.radius > 0)
+        far = 2.0 * math.hypot(*self.size)
+        radius = np.minimum(self.radius[shown], far)
+        labels = clusters(len(shown), *touching(self.x[shown], self.y[shown], radius)) if len(shown) else shown
+        order = np.argsort(labels, kind="stable")
+        cuts = np.flatnonzero(np.diff(labels[order])) + 1
+        return np.split(shown[order], cuts) if len(shown) else []
+
+    def take(self, which: Indices) -> Outlines:
+        """Those of some drops."""
+        return Outlines(self.x[which], self.y[which], self.radius[which], self.size)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Outlines]) -> Outlines:
+        """One after the other; at least one."""
+        x, y, radius = (np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "y", "radius"))
+        return cls(x, y, radius, parts[0].size)
+
+    def pixels(self) -> tuple[Indices, Indices]:
+        """Pixels of the image in the circles: their numbers, row by row, and the drop's, (P,) each.
+
+        In the order of the drops; where circles overlap, a pixel comes up for each.
+        """
+        width, height = self.size
+        x, y = self.x, self.y
+        radius = np.minimum(self.radius, 2.0 * (width + height))
+        first, last = (np.clip(np.ceil(y - radius), 0, height).astype(np.intp),
+                       np.clip(np.floor(y + radius) + 1, 0, height).astype(np.intp))  # fmt: skip
+        drop, row = _ranges(first, np.maximum(last, first))
+        half = np.sqrt(np.maximum(radius[drop] ** 2 - (row - y[drop]) ** 2, 0))
+        start = np.clip(np.ceil(x[drop] - half), 0, width).astype(np.intp)
+        stop = np.clip(np.floor(x[drop] + half) + 1, start, width).astype(np.intp)
+        line, column = _ranges(start, stop)
+        return row[line] * width + column, drop[line]
+
+
+def _ranges(first: Indices, last: Indices) -> tuple[Indices, Indices]:
+    """All whole numbers from first to before last of each of many ranges, and the number of the range."""
+    count = last - first
+    which = np.repeat(np.arange(len(count)), count)
+    step = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+    return which, first[which] + step
+
+
+def _bases(drops: Sequence[Drop], frame: PanelFrame, chamber: Chamber) -> Array:
+    """Points of the faces where drops sit, (N, 3), in the panel frame."""
+    places = {(drop.panel, drop.face) for drop in drops}
+    origins = {place: frame.base(chamber, (0.0, 0.0), *place) for place in places}
+    bases = np.array([origins[drop.panel, drop.face] for drop in drops])
+    bases[:, :2] += [drop.centre for drop in drops]
+    return bases

@@ -1,0 +1,321 @@
+"""Rain on an image: drops of any kind, through a pinhole or a lens, planned once and applied to any number of frames.
+
+Drops whose surroundings in the image meet are traced together, whatever the face they are on; the others on their own.
+A plan holds what each covered pixel looks at (`lookups`), or blurred layers (`defocus`); pixels that no drop covers are
+copied.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rainstereo.camera import Camera
+from rainstereo.chamber import Chamber
+from rainstereo.droplet import Drop, SphericalCap
+from rainstereo.layer import depth_of
+from rainstereo.patch import BORDERS
+from rainstereo.thin_lens import ThinLens
+from rainstereo.types import Array, Image, Indices, Mask
+
+from . import drop_list, linear_light
+from .blurred import BlurredLayer, by_disc
+from .drops import Drops
+from .lookups import Lookups, Paste
+from .minified import Batch, Minifier
+from .outlines import Outlines
+from .rendered import Rendered
+from .streaks import Streak
+
+if TYPE_CHECKING:
+    from . import sequence
+    from .motion import Motion
+
+Key = tuple[Hashable, ...]
+AnyDrops = Drop | Drops | Iterable[Drop | Drops]
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Drops that must be traced together, and where the image shows them."""
+
+    drops: tuple[Drop, ...]
+    outlines: Outlines
+
+    @property
+    def key(self) -> Key:
+        """Equal to that of another group if both look the same."""
+        return tuple(self.drops)
+
+
+@dataclass(frozen=True)
+class Surround:
+    """A border of real content: images are given wider than the frame, by so many pixels on each side."""
+
+    left: int = 0
+    top: int = 0
+    right: int = 0
+    bottom: int = 0
+
+    def __post_init__(self) -> None:
+        for side in (self.left, self.top, self.right, self.bottom):
+            if not (isinstance(side, int) and 0 <= side <= 32766):
+                raise ValueError(f"a border of {side} pixels was given; expected a whole number, 0 or more")
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """How rain is rendered.
+
+    camera, chamber: the chamber in the camera's frame (`Rig.chamber_in`). Images are of the camera's size.
+    depth: of the scene, metres; inf: no parallax.
+    lens: aperture and focus; None: a pinhole. Through a lens each drop is a sharp layer blurred by a disc (`defocus`).
+    tolerance: gray levels RMS of 8 bits inside sharp drops, against 64 exact rays a pixel. inf: one
+    look a pixel, and hard edges, which is the fastest.
+    border: what lies beyond the image: "mirror", "edge", or a `Surround` of it, beyond which it is mirrored.
+    linear_light: whether values are sRGB and light is to be averaged, not values.
+    """
+
+    camera: Camera
+    chamber: Chamber
+    depth: float = math.inf
+    lens: ThinLens | None = None
+    tolerance: float = 1.0
+    border: str | Surround = "mirror"
+    linear_light: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.tolerance > 0:
+            raise ValueError(f"a tolerance of {self.tolerance} was given; expected gray levels, above 0")
+        if not isinstance(self.border, Surround) and self.border not in BORDERS:
+            raise ValueError(f"border {self.border!r} is unknown; expected 'mirror', 'edge' or a Surround(...)")
+        if not self.depth > 0:
+            raise ValueError(f"a depth of {self.depth} was given; expected metres in front of the camera, or inf")
+
+    # -- plans ---------------------------------------------------------------------------------------------------------
+
+    def plan(self, drops: AnyDrops) -> Plan:
+        """Trace drops: one, a table of them, or any mixture of both, in no particular order."""
+        everyone = tuple(shapes(drops))
+        sharp, layers = self.split(everyone)
+        groups = self.groups(sharp)
+        return Plan(self, everyone, tuple(self.lookups(groups, range(len(groups)))), tuple(layers))
+
+    def sequence(self, motion: Motion | None = None) -> sequence.Sequence:
+        """Plans of frame after frame, in which what does not change is traced once. motion: for `Sequence.at`."""
+        from . import sequence  # which needs this module
+
+        return sequence.Sequence(self, motion)
+
+    def split(
+        self, drops: Sequence[Drop], known: Mapping[Key, BlurredLayer] | None = None
+    ) -> tuple[Sequence[Drop], list[BlurredLayer]]:
+        """The sharp drops, and layers of the others, the farthest first; those in `known` are not traced again."""
+        if self.lens is None or math.isinf(self.lens.f_number):
+            return drops, []
+        place = (self.scene_size, self.shift, self.fold)
+        sharp, blurred = by_disc(drops, self.camera, self.chamber, self.lens)
+        known = known or {}
+        layers = [
+            known.get(tuple(some)) or BlurredLayer.of(some, self.camera, self.chamber, self.lens, self.depth, *place)
+            for some in blurred
+        ]
+        return sharp, layers
+
+    def groups(self, drops: Sequence[Drop]) -> list[Group]:
+        """Drops that must be traced together, of those that the image shows."""
+        outlines = Outlines.of(drops, self.camera, self.chamber)
+        return [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in outlines.groups()]
+
+    def lookups(self, groups: Sequence[Group], numbers: Iterable[int]) -> list[Lookups]:
+        """What pixels look at in groups of drops, which get these numbers."""
+        if not groups:
+            return []
+        return self._minifier.lookups(self._batches(groups, np.fromiter(numbers, dtype=np.intp)))
+
+    def _batches(self, groups: Sequence[Group], numbers: Indices) -> list[Batch]:
+        """Caps of a face in one batch if each is alone, in another if not; groups with other drops on their own."""
+        alike: dict[Any, list[int]] = {}
+        for i, group in enumerate(groups):
+            places = {(drop.panel, drop.face, drop.index) for drop in group.drops if isinstance(drop, SphericalCap)}
+            caps = len(places) == 1 and all(isinstance(drop, SphericalCap) for drop in group.drops)
+            alike.setdefault((*places, len(group.drops) == 1) if caps else i, []).append(i)
+        return [_batch([groups[i] for i in some], numbers[some]) for some in alike.values()]
+
+    @cached_property
+    def _minifier(self) -> Minifier:
+        return Minifier(
+            self.camera, self.chamber, self.depth, self.tolerance, self.scene_size, self.shift, self.fold
+        )  # fmt: skip
+
+    # -- the image that holds the scene --------------------------------------------------------------------------------
+
+    @property
+    def fold(self) -> str:
+        """How the scene goes on beyond what is known of it."""
+        return "mirror" if isinstance(self.border, Surround) else self.border
+
+    @property
+    def shift(self) -> tuple[int, int]:
+        """x, y of the frame's first pixel in the images that are given."""
+        return (self.border.left, self.border.top) if isinstance(self.border, Surround) else (0, 0)
+
+    @property
+    def scene_size(self) -> tuple[int, int]:
+        """(width, height) of the images that are given: the camera's, and the surround."""
+        width, height = self.camera.size
+        around = self.border if isinstance(self.border, Surround) else Surround()
+        return width + around.left + around.right, height + around.top + around.bottom
+
+    def framed(self, image: Image) -> Image:
+        """A view of the frame in an image; ValueError unless the image suits."""
+        depth_of(image)
+        if image.shape[1::-1] != self.scene_size:
+            raise ValueError(
+                f"the image has {image.shape[1]} x {image.shape[0]} pixels; expected {self.scene_size[0]} x "
+                f"{self.scene_size[1]}: the camera's {self.camera.width} x {self.camera.height}, and the surround"
+            )
+        (x, y), (width, height) = self.shift, self.camera.size
+        return image[y : y + height, x : x + width]
+
+    # -- as text -------------------------------------------------------------------------------------------------------
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All fields, by name, as a drop list holds them."""
+        border = self.border
+        sides = [border.left, border.top, border.right, border.bottom] if isinstance(border, Surround) else border
+        return {
+            "camera": self.camera, "chamber": self.chamber, "depth": float(self.depth), "lens": self.lens,
+            "tolerance": float(self.tolerance), "border": sides, "linear_light": self.linear_light,
+        }  # fmt: skip
+
+    @classmethod
+    def from_json(cls, text: str) -> tuple[Renderer, list[Drop]]:
+        """The renderer and the drops of `Rendered.drops_json`: `renderer.plan(drops)` gives the same frame."""
+        drops, settings = drop_list.from_json(text)
+        settings.pop("seed", None)
+        if isinstance(settings.get("border"), tuple):
+            settings["border"] = Surround(*settings["border"])
+        try:
+            return cls(**settings), drops
+        except TypeError as error:
+            raise ValueError(f"the drop list's settings are not a renderer's: {error}") from None
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Drops traced for one camera: what serves every frame of a scene while they do not change.
+
+    tables: of the sharp drops. layers: of the blurred ones, the farthest first.
+    """
+
+    renderer: Renderer
+    drops: Sequence[Drop]
+    tables: Sequence[Lookups] = field(repr=False)
+    layers: Sequence[BlurredLayer] = field(repr=False)
+
+    def apply(self, image: Image) -> Image:
+        """A copy of the clear image's frame with drops: (H, W[, 1 to 4]) uint8, uint16 or float32; never changed."""
+        out = self.renderer.framed(image).copy("C")
+        if not self.tables and not self.layers:
+            return out
+        if self.renderer.linear_light:
+            self._in_light(image, out)
+        else:
+            self._paste(np.ascontiguousarray(image), out)
+        return out
+
+    def _paste(self, scene: Image, out: Image) -> None:
+        """Put everything over a frame; scene: the clear image, contiguous."""
+        paste = self._paste_all
+        below = np.ascontiguousarray(self.renderer.framed(scene)) if paste.soft.size else out
+        paste.paste(scene, below, out)
+        for layer in self.layers:
+            layer.paste(scene, out)
+
+    @cached_property
+    def _paste_all(self) -> Paste:
+        return Paste(self.tables)
+
+    def _in_light(self, image: Image, out: Image) -> None:
+        """The same, averaging light; only pixels that drops touch are converted back."""
+        scene = linear_light.decoded(np.ascontiguousarray(image))
+        light = np.ascontiguousarray(self.renderer.framed(scene)).copy()
+        self._paste(scene, light)
+        touched = self.opacity > 0
+        out[touched] = linear_light.encoded(light[touched], out.dtype)
+
+    def render(self, image: Image) -> Rendered:
+        """`apply`, with everything that is known about the pixels."""
+        renderer = self.renderer
+        return Rendered(
+            self.apply(image), self.opacity > 0, self.opacity, self.displacement, self.unknown, self.drops,
+            renderer.settings,
+        )  # fmt: skip
+
+    @cached_property
+    def opacity(self) -> Array:
+        """(H, W) float32: share of each pixel that drops hide."""
+        clear: Image = np.ones(self.renderer.camera.size[::-1], dtype=np.float32)
+        for table in self.tables:
+            clear.ravel()[table.pixels] = table.clear
+        for layer in self.layers:
+            rows, columns, opacity = layer.opacity
+            clear[rows, columns] *= 1 - opacity
+        return np.asarray(1 - clear)
+
+    @cached_property
+    def displacement(self) -> Array:
+        """(H, W, 2) float32; see `Rendered`."""
+        width, height = self.renderer.camera.size
+        moved: Image = np.zeros((height, width, 2), dtype=np.float32)
+        for table in self.tables:
+            moved.reshape(-1, 2)[table.pixels] = table.displacement
+        for layer in self.layers:
+            rows, columns, hidden, displacement = layer.displacement
+            moved[rows, columns][hidden] = displacement[hidden]
+        return moved
+
+    @cached_property
+    def unknown(self) -> Mask:
+        """(H, W): pixels that show something beyond the image."""
+        found = np.zeros(self.renderer.camera.size[::-1], dtype=np.bool_)
+        for table in self.tables:
+            found.ravel()[table.pixels] = table.unknown
+        for layer in self.layers:
+            rows, columns, unknown = layer.unknown
+            found[rows, columns] |= unknown
+        return found
+
+
+def _batch(groups: Sequence[Group], numbers: Indices) -> Batch:
+    """Groups as one batch: one group, or caps of one face."""
+    drops = [drop for group in groups for drop in group.drops]
+    outlines = Outlines.joined([group.outlines for group in groups])
+    pixels, which = outlines.pixels()
+    if len(drops) == len(groups) and isinstance(drops[0], SphericalCap):
+        return Batch(drops, pixels, numbers[which], which)
+    pixels, first = np.unique(pixels, return_index=True)  # circles of different groups share none
+    group = np.repeat(numbers, [len(group.drops) for group in groups])[which[first]]
+    low, high = outlines.y - outlines.radius, outlines.y + outlines.radius
+    return Batch(drops, pixels, group, None, low, high)
+
+
+def shapes(drops: AnyDrops) -> list[Drop]:
+    """Drops as shapes for the tracer: tables become caps, and streaks rows of pieces."""
+    if isinstance(drops, Streak):
+        return list(drops.pieces())
+    if isinstance(drops, Drop):
+        return [drops]
+    if isinstance(drops, Drops):
+        return drops.shapes()
+    return [shape for each in drops for shape in shapes(each)]
+
+
+__all__ = ["AnyDrops", "Plan", "Renderer", "Surround", "shapes"]

@@ -1,0 +1,135 @@
+"""Rain on frame after frame: drops that have not changed are not traced again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Row
+from dataclasses import dataclass
+
+import numpy as np
+
+from rainstereo.droplet import Drop
+from rainstereo.types import Array
+
+from .blurred import BlurredLayer
+from .drops import Drops
+from .lookups import Lookups
+from .metaballs import STEEPEST, bodies, merge
+from .motion import Motion, PaneState
+from .render import AnyDrops, Key, Plan, Renderer, shapes
+
+MOST_GENERATIONS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class _Generation:
+    """Tables of groups that were traced in one frame, or of what is left of them."""
+
+    groups: frozenset[int]
+    tables: list[Lookups]
+
+    def only(self, groups: set[int]) -> _Generation:
+        kept = self.groups & groups
+        if len(kept) == len(self.groups):
+            return self
+        numbers = np.fromiter(sorted(kept), dtype=np.intp, count=len(kept))
+        tables = [table.of_groups(numbers) for table in self.tables]
+        return _Generation(kept, [table for table in tables if len(table.pixels)])
+
+
+class Sequence:
+    """Plans of frame after frame. Each is, bit for bit, what `Renderer.plan` gives for its drops.
+
+    What is kept are the tables of groups of drops that are equal to a group of the frame before: caps of equal numbers,
+    or the very same shapes. A blurred layer is kept while all its drops are.
+    """
+
+    def __init__(self, renderer: Renderer, motion: Motion | None = None) -> None:
+        self.renderer, self.motion = renderer, motion
+        self._numbers: dict[Key, int] = {}
+        self._next = 0
+        self._generations: list[_Generation] = []
+        self._layers: dict[Key, BlurredLayer] = {}
+        self._last: Plan | None = None
+        self._shapes = PaneShapes()
+
+    def at(self, time: float) -> Plan:
+        """The plan for a time of the motion, seconds."""
+        if self.motion is None:
+            raise ValueError("this sequence has no motion; make it with Renderer.sequence(motion), or use `plan`")
+        return self.plan(self._shapes.of(self.motion.at(time)))
+
+    def plan(self, drops: AnyDrops) -> Plan:
+        """The plan for the next frame's drops."""
+        everyone = tuple(shapes(drops))
+        if self._last is not None and self._last.drops == everyone:
+            return self._last
+        sharp, layers = self.renderer.split(everyone, self._layers)
+        self._layers = {tuple(layer.drops): layer for layer in layers}
+        self._last = Plan(self.renderer, everyone, tuple(self._tables(sharp)), tuple(layers))
+        return self._last
+
+    def _tables(self, sharp: Row[Drop]) -> list[Lookups]:
+        """Tables of the groups of sharp drops; only new groups are traced."""
+        groups = self.renderer.groups(sharp)
+        keys = [group.key for group in groups]
+        new = [group for group, key in zip(groups, keys, strict=True) if key not in self._numbers]
+        fresh = range(self._next, self._next + len(new))
+        coming = iter(fresh)
+        numbers = {key: self._numbers[key] if key in self._numbers else next(coming) for key in keys}
+        self._numbers, self._next = numbers, fresh.stop
+        known = set(numbers.values())
+        kept = [generation.only(known) for generation in self._generations]
+        kept = [generation for generation in kept if generation.groups]
+        if new:
+            kept.append(_Generation(frozenset(fresh), self.renderer.lookups(new, fresh)))
+        if len(kept) > MOST_GENERATIONS:  # the first is the largest, and stays
+            late = kept[1:]
+            tables = Lookups.joined([table for generation in late for table in generation.tables])
+            kept = [kept[0], _Generation(frozenset().union(*(generation.groups for generation in late)), tables)]
+        self._generations = kept
+        return [table for generation in kept for table in generation.tables]
+
+
+class PaneShapes:
+    """The shapes of what is on a pane, made once for what does not change."""
+
+    def __init__(self) -> None:
+        self._known: dict[bytes, list[Drop]] = {}
+
+    def of(self, state: PaneState) -> list[Drop]:
+        """Bodies of drops, and trails as rows of pieces. Drops too steep to merge stay caps."""
+        known, found = self._known, list[Drop]()
+        self._known = {}
+        for members in _members(state.drops):
+            key = _bytes(members.x, members.y, members.radius, members.contact_angle)
+            self._known[key] = known[key] if key in known else _body(members)
+            found += self._known[key]
+        for trail in state.trails:
+            key = _bytes(trail.points, trail.half_width, np.array(trail.contact_angle))
+            if key in known:
+                self._known[key] = known[key]
+            else:
+                self._known[key] = list(trail.streak(**state.drops.place).pieces())
+            found += self._known[key]
+        return found
+
+
+def _members(drops: Drops) -> list[Drops]:
+    """The drops of each body."""
+    steep = drops.contact_angle > STEEPEST
+    labels = np.arange(len(drops))
+    labels[~steep] = len(drops) + bodies(drops.take(~steep))
+    order = np.argsort(labels, kind="stable")
+    cuts = np.flatnonzero(np.diff(labels[order])) + 1
+    return [drops.take(rows) for rows in np.split(order, cuts)] if len(drops) else []
+
+
+def _body(members: Drops) -> list[Drop]:
+    return merge(members) if len(members) > 1 else members.shapes()
+
+
+def _bytes(*columns: Array) -> bytes:
+    return b"".join(column.tobytes() for column in columns)
+
+
+__all__ = ["PaneShapes", "Sequence"]
