@@ -1,0 +1,319 @@
+"""Benchmark stage `rain`: rendering rain on a frame beside one interpolation of that frame, and on batches in torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import cv2
+import kornia
+import numpy as np
+import torch
+
+from rainstereo import Camera, Chamber, Panel
+from rainstereo.aperture import aperture
+from rainstereo.apps.bench_harness import Stage, Target, Variant, Work
+from rainstereo.apps.photographs import photograph
+from rainstereo.model.augment import RandomAdherentRain
+from rainstereo.patch import Patch
+from rainstereo.rain.drops import Drops
+from rainstereo.rain.metaballs import field, grown
+from rainstereo.rain.pane import Pane
+from rainstereo.rain.population import Population
+from rainstereo.rain.render import Plan, Renderer
+from rainstereo.thin_lens import ThinLens
+from rainstereo.types import Array, Image
+
+DROPS = 200
+SIDE = 8
+"""Rays along each side of a pixel in the reference of sharp drops."""
+APERTURE_SAMPLES = 1024
+CROP = 96
+"""Side, pixels, of the window in which blurred drops are compared with samples of the aperture."""
+COARSE = 10.0
+"""Gray levels that the coarse setting allows; its one or few looks a pixel alias."""
+BATCH, IMAGE_SIDE, IMAGE_DROPS = 8, 512, 50
+
+
+def build(seed: int, quick: bool) -> Stage:
+    """The stage at 1280x960, or 320x240 if `quick`."""
+    width, height = (320, 240) if quick else (1280, 960)
+    f = 1200 * width / 1280
+    camera = Camera.pinhole(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
+    pane = Chamber((0.0, 0.0, 1.0), 0.057, (Panel(0.003, 1.49),))
+    image: Image = cv2.resize(photograph("motorcycle"), (width, height), interpolation=cv2.INTER_AREA)
+    return Stage(
+        "rain",
+        "rain on a frame",
+        f"Adherent drops of 0.5 to 3 mm on a pane 60 mm away, on {width}x{height} colour frames, beside one "
+        "`cv2.remap` of the whole frame. Drops that stand still are traced once and then cost what they cover.",
+        (
+            _still_work(camera, pane, image, seed, not quick),
+            _moving_work(camera, pane, image, seed, not quick),
+            _blurred_work(camera, pane, image, seed, quick),
+            _merged_work(camera, pane, image, seed, not quick),
+            _batch_work(seed, quick),
+        ),
+        {
+            "camera": f"pinhole {width}x{height}, f {f:.0f} px; with a lens: 4.5 mm at F/1.4, focused at infinity",
+            "pane": "3 mm, index 1.49, its far face at 60 mm, square to the camera",
+            "drops": "preset `drops`, the density scaled to the cover; contact angles around 68 degrees",
+            "image": "8-bit BGR, a photograph from scikit-image",
+            "seed": seed,
+        },
+        (
+            "The default keeps 1 gray level RMS inside drops, against 64 rays a pixel; drops shrink the scene, so that "
+            "takes several looks a pixel at averaged copies of the image.",
+            f"`coarse` allows {COARSE:g} gray levels and mostly looks once, which is what other renderers do.",
+            "A cover is the share of the frame's pixels that drops hide, as rendered.",
+            "Memory-bound work: on a busy machine trust the ratios within a round, not the milliseconds.",
+        ),
+    )
+
+
+# -- drops that stand still ----------------------------------------------------------------------------------------
+
+
+def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised: bool) -> Work:
+    default, coarse = Renderer(camera, pane), Renderer(camera, pane, tolerance=COARSE)
+    frame, copy = _remap(image, seed), "a copy of the frame"
+    variants = [Variant(copy, image.copy, _nothing), Variant("cv2.remap of the frame", frame, _nothing, note="R")]
+    targets = []
+    dry = default.plan([])
+    variants.append(
+        Variant("no drops", partial(dry.apply, image), lambda r: float(np.abs(r - image.astype(int)).max()), True)
+    )
+    targets.append(Target("no drops", copy, 1.2))
+    for share, limit in ((0.02, 0.2), (0.1, 0.6), (0.4, 1.2), (0.9, 1.2)):
+        drops = _rain(camera, pane, share, seed)
+        truth: Callable[[], Image] | None = None
+        for renderer, name in ((default, ""), (coarse, ", coarse")):
+            plan = renderer.plan(drops)
+            label = f"{100 * share:.0f} %{name}"
+            truth = truth or _exactly(drops, camera, pane, image)
+            variants.append(
+                Variant(
+                    label, partial(plan.apply, image), _inside(plan, truth), True,
+                    f"{len(drops)} drops hide {100 * float((plan.opacity > 0).mean()):.0f} %",
+                )
+            )  # fmt: skip
+            targets.append(Target(label, "cv2.remap of the frame", limit))
+    return Work(
+        "still",
+        "Drops that stand still",
+        "Traced before; the time is that of drawing them into one frame.",
+        tuple(variants),
+        "10 %",
+        "gray levels",
+        f"RMS inside drops against {SIDE} x {SIDE} exact rays a pixel; without drops, the largest difference",
+        targets=tuple(targets) if promised else (),
+    )
+
+
+def _moving_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised: bool) -> Work:
+    drops = _rain(camera, pane, 0.1, seed)
+    truth = _exactly(drops, camera, pane, image)
+    frame = "cv2.remap of the frame"
+    variants = [Variant(frame, _remap(image, seed), _nothing, note="R")]
+    for tolerance, name in ((1.0, "10 %, all moving"), (COARSE, "10 %, all moving, coarse")):
+        renderer = Renderer(camera, pane, tolerance=tolerance)
+        work = partial(_anew, renderer, drops, image)
+        variants.append(Variant(name, work, _inside(renderer.plan(drops), truth), True, "traced, planned and drawn"))
+    return Work(
+        "moving",
+        "Drops that all move",
+        "Every drop is traced anew for the frame.",
+        tuple(variants),
+        "10 %, all moving",
+        "gray levels",
+        f"RMS inside drops against {SIDE} x {SIDE} exact rays a pixel",
+        targets=tuple(Target(v.name, frame, 1.5) for v in variants[1:]) if promised else (),
+    )
+
+
+def _anew(renderer: Renderer, drops: Drops, image: Image) -> Image:
+    return renderer.plan(drops).apply(image)
+
+
+# -- out of focus --------------------------------------------------------------------------------------------------
+
+
+def _blurred_work(camera: Camera, pane: Chamber, image: Image, seed: int, quick: bool) -> Work:
+    lens, frame = ThinLens(0.0045, 1.4), "cv2.remap of the frame"
+    drops = _rain(camera, pane, 0.1, seed)
+    plan = Renderer(camera, pane, lens=lens).plan(drops)
+    plan.apply(image)
+    middle = [slice((n - CROP) // 2, (n + CROP) // 2) for n in (camera.height, camera.width)]
+    samples = 64 if quick else APERTURE_SAMPLES
+    near = [drop for drop in drops.shapes() if np.hypot(*drop.centre) < 0.06 * CROP / float(camera.intrinsics[0]) * 2]
+    layer = aperture(near, camera, pane, lens, np.inf, image, samples, window=(middle[0], middle[1]))
+    truth = layer.over(image.astype(np.float32))[middle[0], middle[1]]
+
+    def error(found: Image) -> float:
+        return float(np.sqrt(np.mean(np.square(found[middle[0], middle[1]] - truth))))
+
+    name = "10 % at F/1.4"
+    return Work(
+        "defocus",
+        "Drops out of focus, standing still",
+        "Behind 4.5 mm at F/1.4 focused at infinity: a disc of 65 px.",
+        (
+            Variant(frame, _remap(image, seed), _nothing, note="R"),
+            Variant("nothing drawn", image.copy, error),
+            Variant(name, partial(plan.apply, image), error, True, "traced before"),
+        ),
+        name,
+        "gray levels",
+        f"RMS in {CROP} x {CROP} pixels of the middle against {samples} samples of the aperture",
+        targets=() if quick else (Target(name, frame, 5.0),),
+    )
+
+
+# -- merging -------------------------------------------------------------------------------------------------------
+
+
+def _merged_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised: bool) -> Work:
+    drops = _rain(camera, pane, 0.1, seed)
+    drops = grown(drops.take(slice(0, DROPS)))
+    x, y = Pane.seen(camera, pane).grid(camera.width)
+    frame, name = "cv2.remap of the frame", f"heights of {len(drops)} drops"
+
+    def dense() -> Array:
+        """All drops at all places, largest support first: the metaballs' sum written out."""
+        order = np.argsort(-(0.5 * drops.top), kind="stable")
+        depth = 0.5 * drops.top[order]
+        height = np.full((len(y), len(x)), -np.inf)
+        for i, s in zip(order, depth, strict=True):
+            cap = _cap_height(drops, int(i), x, y)
+            felt, both = cap > -s, (cap > -s) & (height > -s)
+            total = np.cbrt(np.maximum(height + s, 0) ** 3 + np.maximum(cap + s, 0) ** 3) - s
+            height = np.where(both, total, np.where(felt, np.maximum(cap, height), height))
+        return np.maximum(height, 0)
+
+    def error(found: Array) -> float:
+        return 1e6 * float(np.abs(np.maximum(found, 0) - dense()).max())
+
+    return Work(
+        "metaballs",
+        "Drops that merge",
+        "The height of the water at every pixel of the pane, drops that touch being one body.",
+        (
+            Variant(frame, _remap(image, seed), _nothing, note="R"),
+            Variant(name, lambda: field(drops, x, y), error, True),
+            Variant("every drop at every pixel", dense, error, note="the same sum, written out", every=5),
+        ),
+        name,
+        "micrometres",
+        "largest, against the sum over all drops at all pixels in float64",
+        targets=(Target(name, frame, 2.0),) if promised else (),
+    )
+
+
+def _cap_height(drops: Drops, i: int, x: Array, y: Array) -> Array:
+    """Height of one cap's sphere over a grid, below the face too; -inf beyond the sphere."""
+    a, angle = float(drops.radius[i]), float(drops.contact_angle[i])
+    inside = (a / np.sin(angle)) ** 2 - (x - drops.x[i]) ** 2 - (y[:, None] - drops.y[i]) ** 2
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(inside > 0, np.sqrt(inside) - a / np.tan(angle), -np.inf))
+
+
+# -- batches -------------------------------------------------------------------------------------------------------
+
+
+def _batch_work(seed: int, quick: bool) -> Work:
+    """The augmentation beside kornia's own rain and a bare grid_sample."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    side, count = (128, 2) if quick else (IMAGE_SIDE, 512 if device == "cuda" else BATCH)
+    plain = cv2.resize(photograph("astronaut"), (side, side), interpolation=cv2.INTER_AREA)
+    one = torch.from_numpy(np.ascontiguousarray(plain[..., ::-1].transpose(2, 0, 1))).float() / 255
+    images = one.expand(count, -1, -1, -1).contiguous().to(device)
+    grid = torch.nn.functional.affine_grid(
+        torch.eye(2, 3, device=device).expand(count, -1, -1), list(images.shape), False
+    )
+    camera = Camera.pinhole(side, side, (side - 1) / 2, (side - 1) / 2, side, side)
+    pane = Pane.seen(camera, Chamber((0, 0, 1), 0.04, (Panel(0.004, 1.49),)))
+    law = Population.preset("drops")
+    cover = IMAGE_DROPS / (law.density() * pane.area) * law.cover
+    ours = RandomAdherentRain(law, cover=(cover, cover), p=1.0)
+    streaks = kornia.augmentation.RandomRain(
+        p=1.0, drop_height=(10, 20), drop_width=(-5, 5), number_of_drops=(500, 1000)
+    )
+
+    def timed(work: Callable[[], Any]) -> Callable[[], Any]:
+        def run() -> Any:
+            torch.manual_seed(seed)
+            with torch.no_grad():
+                found = work()
+            if device == "cuda":
+                torch.cuda.synchronize()
+            return found
+
+        return run
+
+    def bare() -> torch.Tensor:
+        return torch.nn.functional.grid_sample(images, grid, padding_mode="reflection", align_corners=False)
+
+    name = "RandomAdherentRain"
+    return Work(
+        "batch",
+        f"Batches in torch, on {device}",
+        f"{count} images of {side}x{side}, about {IMAGE_DROPS} sharp drops each, drawn anew, traced exactly.",
+        (
+            Variant(name, timed(lambda: ours(images)), _nothing, True, "drops drawn, traced and rendered"),
+            Variant(
+                "kornia RandomRain", timed(lambda: streaks(images)), _nothing, note="streaks in the air, no optics"
+            ),
+            Variant("grid_sample", timed(bare), _nothing, note="one interpolation of the batch"),
+        ),
+        name,
+        "",
+        "not compared: they draw different things; the augmentation's is tested against the renderer",
+        count,
+        "images",
+    )
+
+
+# -- what all share ------------------------------------------------------------------------------------------------
+
+
+def _rain(camera: Camera, pane: Chamber, share: float, seed: int) -> Drops:
+    """Drops that hide about this share of the frame."""
+    return Population.preset("drops").with_cover(share).sample(seed, Pane.seen(camera, pane))
+
+
+def _remap(image: Image, seed: int) -> Callable[[], Image]:
+    """One interpolation of the whole frame, maps at hand: the yardstick."""
+    rng = np.random.default_rng(seed)
+    maps = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in image.shape[1::-1])), -1)
+    maps += rng.uniform(-3, 3, maps.shape).astype(np.float32)
+    return lambda: cv2.remap(image, maps, np.zeros(0), cv2.INTER_LINEAR)
+
+
+def _nothing(_: object) -> float:
+    return float("nan")
+
+
+def _exactly(drops: Drops, camera: Camera, pane: Chamber, image: Image) -> Callable[[], Image]:
+    """The frame with every pixel of it traced by SIDE x SIDE rays, strip by strip; made when first asked for."""
+    made: list[Image] = []
+
+    def whole() -> Image:
+        if not made:
+            out = image.astype(np.float32)
+            shapes = drops.shapes()
+            for top in range(0, camera.height, 64):
+                window = slice(top, min(top + 64, camera.height)), slice(0, camera.width)
+                Patch.trace(shapes, camera, pane, window=window, density=SIDE).layer(image).paste(out)
+            made.append(out)
+        return made[0]
+
+    return whole
+
+
+def _inside(plan: Plan, truth: Callable[[], Image]) -> Callable[[Image], float]:
+    def error(found: Image) -> float:
+        covered = plan.opacity > 0
+        return float(np.sqrt(np.mean(np.square(found[covered] - truth()[covered]))))
+
+    return error
