@@ -82,7 +82,12 @@ def _stages(options: Options) -> dict[str, Callable[[], int]]:
         str(drive / "dry"), str(drive / "wet"), out / "aligned", out / "rig", pictures=pictures and pictures / "align"
     )
     drops = droplets.Options(
-        out / "droplets", out / "rig", f_number=F_NUMBER, quick=True, pictures=out / "droplets" / "pictures"
+        out / "droplets",
+        out / "rig",
+        f_number=F_NUMBER,
+        tolerance=4.0,
+        quick=True,
+        pictures=out / "droplets" / "pictures",
     )
     rained = rain.Options(
         (str(drive / "wet"),), out / "rain", rig=out / "rig", f_number=F_NUMBER, seed=options.seed, overwrite=True

@@ -20,6 +20,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from rainstereo import imagefile
 from rainstereo.apps.cli import DONE, FAILED
 from rainstereo.apps.rain_claim import claim, key_of, known_share, note_share, set_key
 from rainstereo.apps.rain_frames import Note, Outputs, failure, finished
@@ -30,8 +31,10 @@ from rainstereo.apps.rain_results import note_results
 from rainstereo.apps.rain_settings import Rain, Size, over_set
 from rainstereo.apps.rain_sources import Source, find, refuse_overlap
 from rainstereo.apps.rain_workers import MOST_WORKERS, Crew, Numbered, Work, crew
+from rainstereo.apps.realism import realism_sheet
 from rainstereo.apps.record import Record
 from rainstereo.rain.severity import Met
+from rainstereo.types import Image
 
 __all__ = ["Options", "run"]
 
@@ -51,6 +54,7 @@ def run(options: Options) -> int:
     images, videos = [s for s in sources if not s.is_video], [s for s in sources if s.is_video]
     if options.motion is not None and not videos and not options.sequence:
         raise ValueError("--motion is for sequences and videos; add --sequence if the images are frames of one drive")
+    pairs = _real_pairs(options)
     rain, drive = settings(options, images), _drive(options, images)
     key = key_of(rain, options.format, options.video_format, options.unknown_labels, options.void_label,
                  options.masks, options.displacement, options.drop_lists, options.ssim, drive, options.motion,
@@ -68,6 +72,9 @@ def run(options: Options) -> int:
             notes += _images(work, images, shard, workers, advance)
         notes += [_video(options, rain, outputs, video, advance) for video in _part(videos, shard)]
     wrong = note_results(record, rain, notes, len(sources), met)
+    if pairs:
+        names = [path.stem for path in options.realism_wet]
+        record["realism"] = realism_sheet(pairs, names, rain.setup, options.seed, options.out)
     page = rain_page(options.out, rain, record, notes, met)
     page.write(options.out / "report.html")
     if options.pictures:
@@ -78,6 +85,19 @@ def run(options: Options) -> int:
     for note in wrong:
         console.print(f"not rendered: {note['path']}: {note['reason']}", soft_wrap=True, highlight=False)
     return FAILED if wrong else DONE
+
+
+def _real_pairs(options: Options) -> list[tuple[Image, Image]]:
+    """Rainy and clear images to compare with; ValueError unless they pair up."""
+    if len(options.realism_wet) != len(options.realism_clear):
+        raise ValueError(
+            f"{len(options.realism_wet)} images of --realism-wet and {len(options.realism_clear)} of --realism-clear "
+            "were given; expected as many of both, in one order"
+        )
+    return [
+        (imagefile.read(wet), imagefile.read(clear))
+        for wet, clear in zip(options.realism_wet, options.realism_clear, strict=True)
+    ]
 
 
 def _outputs(options: Options, key: str) -> Outputs:

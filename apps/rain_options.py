@@ -98,6 +98,10 @@ class Options:
     """Of videos; mkv is lossless (FFV1)."""
     ssim: bool = True
     """Whether SSIM is measured, too."""
+    realism_wet: tuple[Path, ...] = ()
+    """Real rainy images: OUT/realism.html shows rain of these options, fitted to them, beside each."""
+    realism_clear: tuple[Path, ...] = ()
+    """The same scenes without rain, of the same sizes, in the same order; shifted sideways if they must be."""
     workers: int = 1
     """Processes that render; 0: one a processor."""
     shard: str = "1/1"

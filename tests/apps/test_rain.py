@@ -524,3 +524,21 @@ def test_camvid_frames_reach_the_severity_of_the_paper(shared_data: Path, tmp_pa
     assert found["severity"]["images_within"] == found["done"] > 10
     assert found["raw"]["psnr"]["mean"] == pytest.approx(16.9, abs=0.1)
     assert 0.4 < found["raw"]["ssim"]["mean"] < 0.75  # the paper's: 0.6064
+
+
+def test_realism_wants_pairs(clear: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = str(clear / "000.png")
+    assert rain(clear, tmp_path / "out", *FEW, "--realism-wet", image, image, "--realism-clear", image) == 2
+    assert "2 images of --realism-wet and 1 of --realism-clear" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_realism_is_written_beside(clear: Path, tmp_path: Path) -> None:
+    wide = picture(1, (320, 240))
+    imagefile.write(tmp_path / "clear.png", wide)
+    assert rain(tmp_path / "clear.png", tmp_path / "rainy", "--preset", "camvid", "--seed", "3") == 0
+    wet, dry = str(tmp_path / "rainy" / "clear.png"), str(tmp_path / "clear.png")
+    out = tmp_path / "out"
+    assert rain(clear, out, "--preset", "camvid", "--realism-wet", wet, "--realism-clear", dry) == 0
+    assert (out / "realism.html").stat().st_size > 10_000
+    assert [pair["name"] for pair in report(out)["realism"]["pairs"]] == ["clear"]
