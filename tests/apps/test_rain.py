@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -172,7 +173,9 @@ def test_a_run_that_is_killed_leaves_whole_files_and_goes_on(tmp_path: Path) -> 
     command = [sys.executable, "-m", "rainstereo.apps.cli", "rain", str(source), "--out", str(out), *FEW]
     for number in (signal.SIGKILL, signal.SIGINT):
         before = len(list(out.glob("*.png")))
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # jobs in the background are started deaf to it
+        silent = subprocess.DEVNULL
+        process = subprocess.Popen(command, stdout=silent, stderr=silent, preexec_fn=heard)  # noqa: PLW1509
         deadline = time.monotonic() + 60
         while len(list(out.glob("*.png"))) < before + 3 and time.monotonic() < deadline:
             time.sleep(0.02)

@@ -327,7 +327,8 @@ def test_inputs_are_not_changed() -> None:
 # -- memory ------------------------------------------------------------------------------------------------------------
 
 MILLION = """
-import math, resource, numpy as np, torch
+import re, numpy as np, torch
+from pathlib import Path
 from rainstereo import Camera, Chamber, Panel
 from rainstereo.droplet import SphericalCap
 from rainstereo.model.drop_trace import trace
@@ -336,13 +337,16 @@ drops = [SphericalCap(tuple(rng.uniform(-0.03, 0.03, 2)), 1e-3, 1.0) for _ in ra
 pixels = torch.from_numpy(rng.uniform(0, 959, (1_000_000, 2)))
 camera, chamber = Camera.pinhole(1200, 1200, 639.5, 479.5, 1280, 960), Chamber((0, 0, 1), 0.06, (Panel(0.003, 1.49),))
 trace(pixels[:100], drops, camera, chamber)
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def most():  # not ru_maxrss, which a process inherits from the one that started it
+    return int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1])
+before = most()
 assert (trace(pixels, drops, camera, chamber).status == 0).sum() > 10_000
-print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+print((most() - before) / 1024)
 """
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory is read from Linux's /proc")
 def test_memory_of_a_million_pixels_and_fifty_drops() -> None:
     """Answers take 58 MB in double precision; what the way there takes does not grow with pixels times drops."""
     done = subprocess.run([sys.executable, "-c", MILLION], capture_output=True, text=True, timeout=120, check=True)
-    assert float(done.stdout) < 500
+    assert 50 < float(done.stdout) < 500
