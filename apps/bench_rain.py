@@ -26,6 +26,7 @@ from rainstereo.thin_lens import ThinLens
 from rainstereo.types import Array, Image
 
 DROPS = 200
+FRAMES = 20
 SIDE = 8
 """Rays along each side of a pixel in the reference of sharp drops."""
 APERTURE_SAMPLES = 1024
@@ -49,6 +50,7 @@ def build(seed: int, quick: bool) -> Stage:
         f"Adherent drops of 0.5 to 3 mm on a pane 60 mm away, on {width}x{height} colour frames, beside one "
         "`cv2.remap` of the whole frame. Drops that stand still are traced once and then cost what they cover.",
         (
+            _dry_work(camera, pane, image, not quick),
             _still_work(camera, pane, image, seed, not quick),
             _moving_work(camera, pane, image, seed, not quick),
             _blurred_work(camera, pane, image, seed, quick),
@@ -63,7 +65,7 @@ def build(seed: int, quick: bool) -> Stage:
             "seed": seed,
         },
         (
-            "The default keeps 1 gray level RMS inside drops, against 64 rays a pixel; drops shrink the scene, so that "
+            "The default aims at 1 gray level RMS inside drops, against 64 rays a pixel; drops shrink the scene, so that "
             "takes several looks a pixel at averaged copies of the image.",
             f"`coarse` allows {COARSE:g} gray levels and mostly looks once, which is what other renderers do.",
             "A cover is the share of the frame's pixels that drops hide, as rendered.",
@@ -75,17 +77,40 @@ def build(seed: int, quick: bool) -> Stage:
 # -- drops that stand still ----------------------------------------------------------------------------------------
 
 
+def _dry_work(camera: Camera, pane: Chamber, image: Image, promised: bool) -> Work:
+    plan = Renderer(camera, pane).plan([])
+
+    def many(work: Callable[[], Image]) -> Image:
+        for _ in range(FRAMES - 1):
+            work()
+        return work()
+
+    def error(found: Image) -> float:
+        return float(np.abs(found.astype(np.int16) - image).max())
+
+    copy, ours = "copies of the frame", "frames without drops"
+    return Work(
+        "dry",
+        "No drops",
+        f"{FRAMES} frames in a row, since one is too quick to time.",
+        (
+            Variant(copy, lambda: many(image.copy), error),
+            Variant(ours, lambda: many(partial(plan.apply, image)), error, True),
+        ),
+        ours,
+        "gray levels",
+        "largest difference to the clear frame",
+        FRAMES,
+        "frames",
+        (Target(ours, copy, 1.2),) if promised else (),
+    )
+
+
 def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised: bool) -> Work:
     default, coarse = Renderer(camera, pane), Renderer(camera, pane, tolerance=COARSE)
-    frame, copy = _remap(image, seed), "a copy of the frame"
-    variants = [Variant(copy, image.copy, _nothing), Variant("cv2.remap of the frame", frame, _nothing, note="R")]
+    variants = [Variant("cv2.remap of the frame", _remap(image, seed), _nothing, note="R")]
     targets = []
-    dry = default.plan([])
-    variants.append(
-        Variant("no drops", partial(dry.apply, image), lambda r: float(np.abs(r - image.astype(int)).max()), True)
-    )
-    targets.append(Target("no drops", copy, 1.2))
-    for share, limit in ((0.02, 0.2), (0.1, 0.6), (0.4, 1.2), (0.9, 1.2)):
+    for share, limit in ((0.02, 0.2), (0.1, 0.6), (0.4, 1.2)):
         drops = _rain(camera, pane, share, seed)
         truth: Callable[[], Image] | None = None
         for renderer, name in ((default, ""), (coarse, ", coarse")):
@@ -106,7 +131,7 @@ def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised
         tuple(variants),
         "10 %",
         "gray levels",
-        f"RMS inside drops against {SIDE} x {SIDE} exact rays a pixel; without drops, the largest difference",
+        f"RMS inside drops against {SIDE} x {SIDE} exact rays a pixel",
         targets=tuple(targets) if promised else (),
     )
 
@@ -305,7 +330,7 @@ def _exactly(drops: Drops, camera: Camera, pane: Chamber, image: Image) -> Calla
             for top in range(0, camera.height, 64):
                 window = slice(top, min(top + 64, camera.height)), slice(0, camera.width)
                 Patch.trace(shapes, camera, pane, window=window, density=SIDE).layer(image).paste(out)
-            made.append(out)
+            made.append(np.minimum(out, 255))  # a drop may be brighter than the bare pane, an image not
         return made[0]
 
     return whole
