@@ -65,8 +65,8 @@ def build(seed: int, quick: bool) -> Stage:
             "seed": seed,
         },
         (
-            "The default aims at 1 gray level RMS inside drops, against 64 rays a pixel; drops shrink the scene, so that "
-            "takes several looks a pixel at averaged copies of the image.",
+            "The default aims at 1 gray level RMS inside drops, against 64 rays a pixel; drops shrink the scene, so "
+            "that takes several looks a pixel at averaged copies of the image.",
             f"`coarse` allows {COARSE:g} gray levels and mostly looks once, which is what other renderers do.",
             "A cover is the share of the frame's pixels that drops hide, as rendered.",
             "Memory-bound work: on a busy machine trust the ratios within a round, not the milliseconds.",

@@ -1,10 +1,8 @@
 """Merging: volume, finite support, continuity, smoothness; against the formula node by node and against lone caps."""
 
 import math
-import time
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -344,28 +342,6 @@ def test_field_of_a_pane() -> None:
     assert np.sqrt(np.mean((found - expected) ** 2)) < 1e-3 * expected.max()
     dry = np.min(np.hypot(x[:, None, None] - drops.x, y[:, None] - drops.y) - 1.2 * drops.radius, -1) > 0
     assert not found[dry.T].any()
-
-
-def test_the_field_of_200_drops_costs_less_than_two_remaps() -> None:
-    """Best of several, in turn, on a frame of 1280 x 960 pixels; 1.2 remaps on an idle processor."""
-    pixel = 0.05e-3
-    part = Pane((0, 0), (1280 * pixel, 960 * pixel))
-    drops = ScatteredPopulation(LogNormal(1.3e-3, 0.5, 0.5e-3, 3e-3), 0.15).sample(3, part)
-    drops = grown(drops.take(slice(0, 200)))
-    assert 0.08 < drops.cover(part) < 0.2
-    image = np.random.default_rng(0).integers(0, 255, (960, 1280, 3), dtype=np.uint8)
-    u, v = np.meshgrid(np.arange(1280, dtype=np.float32) + 0.3, np.arange(960, dtype=np.float32) + 0.3)
-    grid, times = part.grid(1280), np.full((2, 12), np.inf)
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    for i in range(12):
-        start = time.perf_counter()
-        cv2.remap(image, u, v, cv2.INTER_LINEAR)
-        middle = time.perf_counter()
-        field(drops, *grid)
-        times[:, i] = middle - start, time.perf_counter() - middle
-    cv2.setNumThreads(threads)
-    assert times[1].min() < 2 * times[0].min()
 
 
 def test_no_drops_and_one() -> None:

@@ -1,9 +1,7 @@
 """The tracer under stress: many drops, drops in a row, extreme places and shapes, bad input, and its speed."""
 
 import math
-import time
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -259,34 +257,3 @@ def test_bad_input_is_named() -> None:
 
 
 # -- speed -------------------------------------------------------------------------------------------------------------
-
-
-def _fastest(function: object, repeat: int = 15) -> float:
-    times = []
-    for _ in range(repeat):
-        start = time.process_time()
-        function()  # type: ignore[operator]
-        times.append(time.process_time() - start)
-    return min(times)
-
-
-@pytest.mark.slow
-def test_speed_against_a_remap() -> None:
-    """A tenth of the frame is traced in the processor time of one full-frame remap; a new depth costs a tenth of that.
-
-    The bound here is twice as wide, because machines that run tests are busy.
-    """
-    x, y = np.meshgrid(np.arange(470, 811.5), np.arange(300, 660.0))
-    pixels = np.stack([x, y], -1).reshape(-1, 2).astype(np.float32)
-    image = np.random.default_rng(0).integers(0, 255, (960, 1280, 3), dtype=np.uint8)
-    x, y = np.meshgrid(np.arange(1280), np.arange(960))
-    target = (np.stack([x, y], -1) * 0.98 + 3.3).astype(np.float32)
-    drop = cap(60, radius=0.02)
-    t = trace(pixels, drop, CAMERA, pane(), 20.0)
-    assert (t.status == 0).all()
-    assert len(pixels) >= 122880
-    tracing = _fastest(lambda: trace(pixels, drop, CAMERA, pane(), 20.0))
-    remap = _fastest(lambda: cv2.remap(image, target, None, cv2.INTER_LINEAR))  # type: ignore[call-overload]
-    again = _fastest(lambda: t.at(5.0))
-    assert tracing <= 2 * remap
-    assert again <= 0.1 * tracing
