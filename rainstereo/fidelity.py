@@ -178,6 +178,9 @@ class _Judge:
         look = tiers.tracer(tier, *self.of)
         squares, lost = _displacement(self.probes, look, self.exact, camera)
         pixels = SAFETY * math.sqrt(upper(squares))
+        if tier.method is Method.BAKED:  # between texels, codes of eight bits average; on them, they do not
+            on_texels, _ = _displacement(np.rint(self.probes), look, self.exact, camera)
+            pixels = max(pixels, SAFETY * math.sqrt(upper(on_texels)))
         if pixels > 0:
             pixels += RESOLUTION
         gray = SAFETY * self.gray.error(tier, look) + ROUNDING if levels else math.nan
