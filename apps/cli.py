@@ -27,7 +27,8 @@ class Command(NamedTuple):
 
 COMMANDS: dict[str, Command] = {
     "demo": Command(
-        "a digital rig, recorded, calibrated and aligned: see it all at once", "rainstereo demo --out out/demo"
+        "a digital rig, recorded, calibrated, aligned and rained on: see it all at once",
+        "rainstereo demo --out out/demo",
     ),
     "simulate": Command(
         "a recording by a digital rig, and the truth about it", "rainstereo simulate --out out/recording"
