@@ -21,6 +21,7 @@ FOLDERS = {
 MAY_IMPORT = {"rainstereo": {"rainstereo"}, "calib": {"rainstereo", "calib"}, "model": {"rainstereo", "model"},
               "apps": {"rainstereo", "calib", "model", "apps"}}  # fmt: skip
 CORE_NEEDS = {"rainstereo", "numpy", "cv2", "scipy"}
+HARDWARE_NEEDS = CORE_NEEDS | {"serial", "imagecodecs", "gi", "pypylon"}
 MRCAL_HERE = {"calib/mrcal_versions.py": "anywhere", "rainstereo/camera.py": "lazily"}
 SAYS_NOTHING = {"utils", "util", "helpers", "helper", "common", "misc"}
 
@@ -95,8 +96,9 @@ def _complaint(folder: str, where: str, name: str, at_import_time: bool) -> str 
     target = floor(name)
     if target is not None and target not in MAY_IMPORT[folder]:
         return f"imports {name}; {folder} may not know of {target}"
-    if folder == "rainstereo" and top not in CORE_NEEDS and top not in sys.stdlib_module_names:
-        return f"imports {name}; the core needs only {', '.join(sorted(CORE_NEEDS))}"
+    needs = HARDWARE_NEEDS if where.startswith("rainstereo/hardware/") else CORE_NEEDS
+    if folder == "rainstereo" and top not in needs and top not in sys.stdlib_module_names:
+        return f"imports {name}; the core needs only {', '.join(sorted(needs))}"
     return None
 
 
@@ -123,6 +125,8 @@ BREACHES = {
     "mrcal in apps": ("apps/a.py", "def f():\n    import mrcal", "only calib/mrcal_versions.py"),
     "mrcal elsewhere in calib": ("calib/solve.py", "from mrcal import optimize", "only calib/mrcal_versions.py"),
     "mrcal at import time in camera": ("rainstereo/camera.py", "import mrcal", "only calib/mrcal_versions.py"),
+    "serial in the core": ("rainstereo/a.py", "import serial", "the core needs only"),
+    "torch in hardware": ("rainstereo/hardware/a.py", "import torch", "the core needs only"),
     "utils": ("calib/utils.py", "x = 1", "a name that says nothing"),
     "common folder": ("apps/common/a.py", "x = 1", "a name that says nothing"),
     "too long": ("model/a.py", "x = 1\n" * (LONGEST + 1), f"at most {LONGEST}"),
