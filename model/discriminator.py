@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from rainstereo.model.convolution_blocks import normalisation
+from rainstereo.model.image_batch import RGB
 
-RGB = 3
 KERNEL = 4
 SLOPE = 0.2
 WIDEST = 8
@@ -33,12 +34,14 @@ class DiscriminatorConfig:
     base_channels: of the first layer; doubled with each layer, up to 8 times. layers: convolutions, all but the last
     two of stride 2. scales: discriminators, each on images of half the size of the one before it.
     normalisation: "instance" or "none", of all layers but the first and the last.
+    conditional: it sees the rainy image besides, as in Pix2Pix.
     """
 
     base_channels: int = 64
     layers: int = 5
     scales: int = 1
     normalisation: str = "instance"
+    conditional: bool = False
 
     def __post_init__(self) -> None:
         for name, (low, high) in RANGES.items():
@@ -47,6 +50,8 @@ class DiscriminatorConfig:
                 raise ValueError(f"{name} {value!r} was given; expected a whole number in {low}..{high}")
         if self.normalisation not in NORMALISATIONS:
             raise ValueError(f"normalisation {self.normalisation!r} is unknown; expected 'instance' or 'none'")
+        if type(self.conditional) is not bool:
+            raise ValueError(f"conditional {self.conditional!r} was given; expected true or false")
 
     @property
     def smallest_side(self) -> int:
@@ -59,13 +64,13 @@ class DiscriminatorConfig:
 
 
 class PatchDiscriminator(nn.Module):
-    """(B, 3, H, W) to the activations of its layers."""
+    """(B, 3 or 6, H, W) to the activations of its layers."""
 
     def __init__(self, config: DiscriminatorConfig) -> None:
         super().__init__()
         widths = [config.base_channels * min(1 << i, WIDEST) for i in range(config.layers - 1)]
         layers = []
-        before = RGB
+        before = 2 * RGB if config.conditional else RGB
         for i, width in enumerate(widths):
             last_but_one = i == len(widths) - 1
             layers.append(
@@ -100,14 +105,19 @@ class Discriminator(nn.Module):
             if isinstance(module, nn.Conv2d):
                 nn.init.normal_(module.weight, 0.0, 0.02)
 
-    def forward(self, images: Tensor) -> list[Activations]:
-        """The activations."""
+    def forward(self, images: Tensor, rainy: Tensor | None = None) -> list[Activations]:
+        """The activations. rainy: what the images were made from, for a conditional one; others do not look at it."""
         least = self.config.smallest_side
         if images.ndim != 4 or images.shape[1] != RGB or min(images.shape[2:]) < least:
             raise ValueError(
                 f"images have shape {tuple(images.shape)}; expected (batch, 3, height, width) with sides of at least "
                 f"{least} for {self.config.scales} scales"
             )
+        if self.config.conditional:
+            if rainy is None or rainy.shape != images.shape:
+                given = "none" if rainy is None else tuple(rainy.shape)
+                raise ValueError(f"a conditional discriminator needs rainy images {tuple(images.shape)}; got {given}")
+            images = torch.cat([images, rainy], 1)
         images = 2 * images - 1
         found = []
         for i, discriminator in enumerate(self.scales):
