@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -15,7 +15,13 @@ from torch import Tensor, nn
 
 from rainstereo.model.architectures import config_of
 from rainstereo.model.dataset import Batch
+from rainstereo.model.losses import GeneratorLoss, discriminator_loss
+from rainstereo.model.pool import DerainedPool
 from rainstereo.model.recipe import Recipe
+from rainstereo.model.vgg import VggFeatures
+
+Parts: TypeAlias = list[tuple[Tensor, Tensor]]
+"""Rainy and clear images of the parts that a batch is taken in."""
 
 PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16}
 STEP_SEED = 3
@@ -47,16 +53,26 @@ class Trainer:
             )
         self.config = config_of(recipe.architecture, recipe.network)
         self._format = torch.channels_last if recipe.compute.channels_last else torch.contiguous_format
+        self._autocast = PRECISIONS.get(recipe.compute.precision)
+        self.scaler = torch.amp.GradScaler(device.type, enabled=self._autocast is torch.float16)
         torch.manual_seed(recipe.seed)
-        self.generator: nn.Module = self._placed(self.config.build())
-        self.average: nn.Module | None = None
-        if recipe.optimizer.ema:
-            self.average = copy.deepcopy(self.generator).requires_grad_(False)
+        self.generator = self._placed(self.config.build())
         self.generator_optimizer = self._adam(self.generator)
-        autocast = PRECISIONS.get(recipe.compute.precision)
-        self._autocast = autocast
-        self.scaler = torch.amp.GradScaler(device.type, enabled=autocast is torch.float16)
-        self._run_generator = self._replicated(self.generator, recipe.compute.compile)
+        self.average = copy.deepcopy(self.generator).requires_grad_(False) if recipe.optimizer.ema else None
+        self.discriminator: nn.Module | None = None
+        if recipe.losses.need_discriminator:
+            self.discriminator = self._placed(recipe.discriminator.build())
+            self.discriminator_optimizer = self._adam(self.discriminator)
+            self._run_discriminator = self._replicated(self.discriminator)
+        features = VggFeatures(recipe.vgg or None, recipe.seed) if recipe.losses.lambda_perceptual else None
+        self.features = "none" if features is None else features.label
+        self._loss = self._placed(GeneratorLoss(recipe.losses, features))
+        self._run_generator = self._replicated(self.generator)
+        if recipe.compute.compile:
+            self._run_generator = torch.compile(self._run_generator)  # type: ignore[assignment]
+        share, size = recipe.optimizer.batch // world, recipe.optimizer.pool
+        size = max(1, size // recipe.optimizer.batch) if size else 0
+        self.pools = [DerainedPool(size, recipe.seed + rank * share + i) for i in range(share)]
         self.done = 0
         self.skipped = 0
 
@@ -68,36 +84,72 @@ class Trainer:
     def step(self, batch: Batch, progress: float) -> Stepped:
         """Learn from a batch. progress: share of the run that is over, for the schedule.
 
-        A batch or a loss that is not finite changes nothing and is counted.
+        A batch that is not finite changes nothing; a network whose gradients are not finite stays as it is. Either is
+        counted in `skipped`.
         """
-        seed = np.random.SeedSequence([self.recipe.seed, STEP_SEED, self.done, self.rank]).generate_state(2, np.uint32)
-        torch.manual_seed(int(seed[0]) << 31 ^ int(seed[1]))
-        for group in self.generator_optimizer.param_groups:
-            group["lr"] = self.rate(progress)
+        words = [self.recipe.seed, STEP_SEED, self.done, self.rank]
+        torch.manual_seed(int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1)))
+        rate = self.rate(progress)
+        self.done += 1
         rainy, clear = self._moved(batch.rainy), self._moved(batch.clear)
         if not self._everywhere(bool(torch.isfinite(rainy).all() & torch.isfinite(clear).all())):
-            return self._skip(f"not finite: {', '.join(batch.names)}")
+            self.skipped += 1
+            return Stepped(skipped="values that are not finite")
         count = self.recipe.optimizer.accumulate
         parts = list(zip(rainy.chunk(count), clear.chunk(count), strict=True))
-        losses: dict[str, Tensor] = {}
-        self.generator_optimizer.zero_grad(set_to_none=True)
-        for i, (part_rainy, part_clear) in enumerate(parts):
-            with self._alone(self._run_generator, i + 1 < len(parts)):
-                with self._casting():
-                    derained = self._run_generator(part_rainy)
-                found = self._generator_losses(derained.float(), part_clear)
-                total = sum((weight * loss for weight, loss in found.values()), torch.zeros((), device=self.device))
-                self.scaler.scale(total / len(parts)).backward()
-            for name, (_, loss) in found.items():
-                losses[name] = losses.get(name, torch.zeros((), device=self.device)) + loss.detach() / len(parts)
-        values = {name: float(loss) for name, loss in losses.items()}
-        if not self._everywhere(all(map(math.isfinite, values.values()))):
-            return self._skip(f"a loss is not finite: {', '.join(batch.names)}")
-        self._update(self.generator_optimizer, self.generator)
+        # in one part, both networks learn from one pass of the generator; in several, keeping all passes would take the
+        # memory that parts are to save
+        first = [self._derained(parts[0][0])] if count == 1 else []
+        losses: dict[str, float] = {}
+        good = True
+        if self.discriminator is not None:
+            losses, good = self._discriminator_step(parts, first, rate)
+        if good:
+            found, good = self._generator_step(parts, first, rate)
+            losses |= found
         self.scaler.update()
+        if not good:
+            self.skipped += 1
+            return Stepped(losses, "gradients that are not finite")
         self._follow()
-        self.done += 1
-        return Stepped(values)
+        return Stepped(losses)
+
+    def _discriminator_step(self, parts: Parts, first: list[Tensor], rate: float) -> tuple[dict[str, float], bool]:
+        """L_disc of clear images and of derained ones from the pool."""
+        total = torch.zeros((), device=self.device)
+        size = len(parts[0][0])
+        for i, (rainy, clear) in enumerate(parts):
+            if first:
+                derained = first[i].detach()
+            else:
+                with torch.no_grad():
+                    derained = self._derained(rainy)
+            pools = self.pools[i * size : (i + 1) * size]
+            shown = torch.cat([pool.query(image[None]) for pool, image in zip(pools, derained, strict=True)])
+            with self._alone(self._run_discriminator, i + 1 < len(parts)):
+                with self._casting():
+                    loss = discriminator_loss(self._run_discriminator, clear, shown) / len(parts)
+                self.scaler.scale(loss).backward()
+            total += loss.detach()
+        return {"discriminator": float(total)}, self._update(self.discriminator_optimizer, rate)
+
+    def _generator_step(self, parts: Parts, first: list[Tensor], rate: float) -> tuple[dict[str, float], bool]:
+        """L_gen, against the discriminator that has just learnt."""
+        losses: dict[str, Tensor] = {}
+        for i, (rainy, clear) in enumerate(parts):
+            with self._alone(self._run_generator, i + 1 < len(parts)):
+                derained = first[i] if first else self._derained(rainy)
+                with self._casting():
+                    found = self._loss(clear, derained, self.discriminator)
+                self.scaler.scale(found["total"] / len(parts)).backward()
+            for name, loss in found.items():
+                losses[name] = losses.get(name, 0) + loss.detach() / len(parts)
+        return {name: float(loss) for name, loss in losses.items()}, self._update(self.generator_optimizer, rate)
+
+    def _derained(self, rainy: Tensor) -> Tensor:
+        with self._casting():
+            derained: Tensor = self._run_generator(rainy)
+        return derained.float()
 
     def rate(self, progress: float) -> float:
         """The learning rate at this step."""
@@ -106,16 +158,6 @@ class Trainer:
         if o.schedule == "cosine":
             rate *= o.final + (1 - o.final) * 0.5 * (1 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
         return rate
-
-    # -- losses --------------------------------------------------------------------------------------------------------
-
-    def _generator_losses(self, derained: Tensor, clear: Tensor) -> dict[str, tuple[float, Tensor]]:
-        """Weight and value of each loss that counts."""
-        weights = self.recipe.losses
-        found: dict[str, tuple[float, Tensor]] = {}
-        if weights.pixel:
-            found["pixel"] = weights.pixel, nn.functional.l1_loss(derained, clear)
-        return found
 
     # -- what it stands on ---------------------------------------------------------------------------------------------
 
@@ -130,12 +172,12 @@ class Trainer:
         o = self.recipe.optimizer
         return torch.optim.Adam(module.parameters(), lr=o.rate, betas=(o.beta1, o.beta2))
 
-    def _replicated(self, module: nn.Module, compiled: bool) -> nn.Module:
-        """The module as it is run: gradients averaged over processes, compiled if asked for."""
-        if self.world > 1:
-            ids = [self.device.index] if self.device.type == "cuda" else None
-            module = nn.parallel.DistributedDataParallel(module, device_ids=ids)
-        return torch.compile(module) if compiled else module  # type: ignore[return-value]
+    def _replicated(self, module: nn.Module) -> nn.Module:
+        """The module as it is run: with gradients averaged over processes."""
+        if self.world == 1:
+            return module
+        ids = [self.device.index] if self.device.type == "cuda" else None
+        return nn.parallel.DistributedDataParallel(module, device_ids=ids, broadcast_buffers=False)
 
     def _casting(self) -> AbstractContextManager[Any]:
         return nullcontext() if self._autocast is None else torch.autocast(self.device.type, self._autocast)
@@ -157,17 +199,27 @@ class Trainer:
         torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MIN)
         return bool(flag.item())
 
-    def _update(self, optimizer: torch.optim.Adam, module: nn.Module) -> None:
-        if self.recipe.optimizer.clip:
+    def _update(self, optimizer: torch.optim.Adam, rate: float) -> bool:
+        """Change the weights, unless a gradient is not finite. Gradients are the same in all processes, so is this."""
+        gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+        good = True
+        if self._autocast is not torch.float16 or self.recipe.optimizer.clip:
             self.scaler.unscale_(optimizer)
-            nn.utils.clip_grad_norm_(module.parameters(), self.recipe.optimizer.clip)
-        self.scaler.step(optimizer)
+            norm = nn.utils.get_total_norm(gradients)
+            # too large for half precision happens now and then: the scaler then leaves the weights alone
+            good = self._autocast is torch.float16 or bool(norm.isfinite())
+            if self.recipe.optimizer.clip and good:
+                nn.utils.clip_grads_with_norm_(self._weights(optimizer), self.recipe.optimizer.clip, norm)
+        if good:
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+            self.scaler.step(optimizer)
+        optimizer.zero_grad(set_to_none=True)
+        return good
 
-    def _skip(self, why: str) -> Stepped:
-        self.generator_optimizer.zero_grad(set_to_none=True)
-        self.done += 1
-        self.skipped += 1
-        return Stepped(skipped=why)
+    @staticmethod
+    def _weights(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+        return [p for group in optimizer.param_groups for p in group["params"]]
 
     @torch.no_grad()
     def _follow(self) -> None:
@@ -183,23 +235,45 @@ class Trainer:
     # -- exact resume --------------------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Everything that steps change: tensors by name, and plain values."""
+        """Everything that steps change: tensors by name, and plain values. All processes must call it together."""
         tensors = {f"generator.{name}": tensor for name, tensor in self.generator.state_dict().items()}
+        tensors |= _optimizer_tensors("generator_optimizer", self.generator_optimizer)
         if self.average is not None:
             tensors |= {f"average.{name}": tensor for name, tensor in self.average.state_dict().items()}
-        tensors |= _optimizer_tensors("generator_optimizer", self.generator_optimizer)
+        if self.discriminator is not None:
+            tensors |= {f"discriminator.{name}": tensor for name, tensor in self.discriminator.state_dict().items()}
+            tensors |= _optimizer_tensors("discriminator_optimizer", self.discriminator_optimizer)
+            tensors |= self._pool_tensors()
         scaler = {key: value for key, value in self.scaler.state_dict().items() if isinstance(value, (int, float))}
         return tensors, {"done": self.done, "skipped": self.skipped, "scaler": scaler}
 
     def restore(self, tensors: Mapping[str, Tensor], values: Mapping[str, Any]) -> None:
         """Go on from what `state` gave; ValueError where it is another run's."""
         self.generator.load_state_dict(_under("generator", tensors))
+        _restore_optimizer("generator_optimizer", self.generator_optimizer, tensors)
         if self.average is not None:
             self.average.load_state_dict(_under("average", tensors))
-        _restore_optimizer("generator_optimizer", self.generator_optimizer, tensors)
+        if self.discriminator is not None:
+            self.discriminator.load_state_dict(_under("discriminator", tensors))
+            _restore_optimizer("discriminator_optimizer", self.discriminator_optimizer, tensors)
+            for i, pool in enumerate(self.pools, self.rank * len(self.pools)):
+                pool.load_state_dict(_under(f"pool.{i}", tensors), self.device)
         if values.get("scaler"):
-            self.scaler.load_state_dict(dict(values["scaler"]))
+            self.scaler.load_state_dict({**self.scaler.state_dict(), **values["scaler"]})
         self.done, self.skipped = int(values["done"]), int(values["skipped"])
+
+    def _pool_tensors(self) -> dict[str, Tensor]:
+        """Of the pools of all processes; each holds those of its own windows."""
+        own = {
+            f"pool.{i}.{name}": tensor
+            for i, pool in enumerate(self.pools, self.rank * len(self.pools))
+            for name, tensor in pool.state_dict().items()
+        }
+        if self.world == 1:
+            return own
+        found: list[dict[str, Tensor]] = [{} for _ in range(self.world)]
+        torch.distributed.all_gather_object(found, own)
+        return {name: tensor for part in found for name, tensor in part.items()}
 
 
 def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
