@@ -22,7 +22,7 @@ from safetensors.torch import load as parse_tensors
 from safetensors.torch import save as tensor_bytes
 from torch import Tensor, nn
 
-from rainstereo.model.architectures import config_of
+from rainstereo.model.architecture import configure
 from rainstereo.model.card import Card, from_toml, to_toml
 
 SUFFIX = ".safetensors"
@@ -47,7 +47,7 @@ class Checkpoint:
 
     @property
     def architecture(self) -> str:
-        """The network's name, as in `architectures`."""
+        """The network's name, as in `architecture`."""
         return str(self.card.get("architecture", ""))
 
     @property
@@ -57,7 +57,7 @@ class Checkpoint:
         if not isinstance(values, dict):
             raise DamagedCheckpointError(f"{self.path}: the card has no table `config`")
         try:
-            return config_of(self.architecture, values)
+            return configure(self.architecture, values)
         except (ValueError, TypeError) as error:
             raise DamagedCheckpointError(f"{self.path}: {error}; a newer rainstereo may know it") from error
 

@@ -143,7 +143,7 @@ class KeepOptions:
 class Recipe:
     """A run: it ends after `steps`, or, if that comes first, after so many `minutes` (0: no limit).
 
-    architecture, network: the generator's name in `architectures` and its options. losses: lambdas, see `losses`; the
+    architecture, network: the generator's name in `architecture` and its options. losses: lambdas, see `losses`; the
     discriminator is trained only where they need it. vgg: file of VGG-19 weights for the perceptual loss; without it
     features are random, and labelled so. name, notes: for the card.
     """
@@ -151,7 +151,7 @@ class Recipe:
     seed: int = 0
     steps: int = 200_000
     minutes: float = 0.0
-    architecture: str = "derain"
+    architecture: str = "generator"
     data: DataOptions = field(default_factory=DataOptions)
     rain: RainOptions = field(default_factory=RainOptions)
     augment: AugmentOptions = field(default_factory=AugmentOptions)

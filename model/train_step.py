@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rainstereo.model.architectures import config_of
+from rainstereo.model.architecture import configure
 from rainstereo.model.dataset import Batch
 from rainstereo.model.losses import GeneratorLoss, discriminator_loss
 from rainstereo.model.pool import DerainedPool
@@ -51,7 +51,7 @@ class Trainer:
                 f"optimizer.batch {recipe.optimizer.batch} cannot be shared by {world} processes in "
                 f"{recipe.optimizer.accumulate} parts; give a multiple of {world * recipe.optimizer.accumulate}"
             )
-        self.config = config_of(recipe.architecture, recipe.network)
+        self.config = configure(recipe.architecture, recipe.network)
         self._format = torch.channels_last if recipe.compute.channels_last else torch.contiguous_format
         self._autocast = PRECISIONS.get(recipe.compute.precision)
         self.scaler = torch.amp.GradScaler(device.type, enabled=self._autocast is torch.float16)
