@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from .frame import Event
 from .pump import WATCHDOG_MS, Pump
 from .schedule import Planned
-from .segment_log import SegmentLog
+from .pump_log import SegmentLog
 
 
 @dataclass(frozen=True)
