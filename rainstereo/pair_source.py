@@ -52,8 +52,11 @@ class PairSource(Protocol):
 
     def __len__(self) -> int: ...
 
+    def name(self, index: int) -> str:
+        """The pair's name, at no cost."""
+
     def moment(self, index: int) -> Moment:
-        """What is known of a pair before its images are read."""
+        """What is known of the pair; may cost as much as reading it."""
 
     def read(self, index: int) -> tuple[Moment, Image, Image]:
         """The pair: moment, dry and wet image, uint8 or uint16. BadPairError where there is none."""
@@ -72,8 +75,12 @@ class FilePairs:
     def __len__(self) -> int:
         return len(self.moments)
 
+    def name(self, index: int) -> str:
+        """The pair's name."""
+        return self.moments[index].name
+
     def moment(self, index: int) -> Moment:
-        """What is known of a pair."""
+        """What is known of the pair."""
         return self.moments[index]
 
     def read(self, index: int) -> tuple[Moment, Image, Image]:
@@ -142,7 +149,7 @@ def _files(dry: str, wet: str, sync_us: float, drive: str) -> FilePairs:
                              f"{sync_us / 1000:g} were allowed"))  # fmt: skip
             continue
         moments.append(Moment(pair.name, str(pair.dry), str(pair.wet), when, drive, "", apart))
-    return FilePairs(tuple(moments), (*map(_words, pairing.unpaired), *problems))
+    return FilePairs(_renamed(moments), (*map(_words, pairing.unpaired), *problems))
 
 
 def _by_time(
@@ -162,10 +169,10 @@ def _by_time(
         for i, path in enumerate(files[k])
         if i not in used[k]
     ]
-    return FilePairs(tuple(moments), (*alone, *times[0].problems, *times[1].problems))
+    return FilePairs(_renamed(moments), (*alone, *times[0].problems, *times[1].problems))
 
 
-def renamed(moments: Sequence[Moment]) -> tuple[Moment, ...]:
+def _renamed(moments: Sequence[Moment]) -> tuple[Moment, ...]:
     """Moments whose names are unique whatever the case: file systems may not tell `A.png` from `a.png`."""
     seen: set[str] = set()
     unique = []

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from .pair_source import BadPairError, Moment, stamp_of
+from .pair_source import RECORDING, BadPairError, Moment, stamp_of
 from .types import Image
 
 
@@ -25,6 +25,10 @@ class RecordingPairs:
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_recording": None}
 
+    def name(self, index: int) -> str:
+        """The pair's number in the recording."""
+        return f"{index:06d}"
+
     def moment(self, index: int) -> Moment:
         """As `read` without the images; the recording keeps both together, so it costs as much."""
         return self.read(index)[0]
@@ -39,13 +43,12 @@ class RecordingPairs:
         time = frame.device_ts_ns if frame.device_ts_ns is not None else frame.host_ts_ns
         when = None if time is None else int(time) // 1000
         sync = float(frame.sync_us) if frame.sync_us is not None else math.nan
-        moment = Moment(f"{index:06d}", where, where, when, self.drive, str(frame.regime or ""), sync)
+        moment = Moment(self.name(index), where, where, when, self.drive, str(frame.regime or ""), sync)
         return moment, frame.dry, frame.wet
 
     def stamp(self, index: int) -> str:
-        """That of the recording's description, which names its segments, and its files' total size."""
-        total = sum(path.stat().st_size for path in Path(self.path).iterdir() if path.is_file())
-        return f"{stamp_of(Path(self.path) / 'recording.toml')} {total} {index}"
+        """That of the recording's description: what it holds is only ever appended to."""
+        return f"{stamp_of(Path(self.path) / RECORDING)} {index}"
 
     def _opened(self) -> Any:
         if self._recording is None:

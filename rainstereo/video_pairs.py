@@ -43,11 +43,15 @@ class VideoPairs:
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_open": [], "_next": 0}
 
+    def name(self, index: int) -> str:
+        """The frame's number."""
+        return f"{index:06d}"
+
     def moment(self, index: int) -> Moment:
         """Name and time of a frame; its time is counted from the beginning of the video."""
         when = round(index * 1e6 / self._fps) if self._fps > 0 else None
         dry, wet = (f"{path}#{index}" for path in self.paths)
-        return Moment(f"{index:06d}", dry, wet, when, self.drive)
+        return Moment(self.name(index), dry, wet, when, self.drive)
 
     def read(self, index: int) -> tuple[Moment, Image, Image]:
         """Frame `index` of both."""
