@@ -134,10 +134,9 @@ def run(options: Options) -> int:
     sources = [str(folder) for folder in options.folders] + [s for s in (options.dry, options.wet) if s]
     told = card(rows, selection, settings, len(found.pairs), sources, options.licence, options.rig, found.notes)
     write_rejected(options.out / "rejected.csv", selection.rejected, found.pairs)
-    if write_parquet(options.out / "manifest.parquet", rows) is None:
-        console.print(
-            "manifest.parquet was not written: it needs pyarrow (pip install pyarrow); manifest.csv has it all"
-        )
+    lacking = write_parquet(options.out / "manifest.parquet", rows)
+    if lacking:
+        console.print(f"manifest.parquet was not written, manifest.csv has it all: {lacking}", soft_wrap=True)
     write_csv(options.out / "manifest.csv", COLUMNS, rows)
     write_card(options.out, told)
     for key in ("splits", "reserved_for_labels", "rejected", "split_by", "nearest_across_splits_bits", "cover"):

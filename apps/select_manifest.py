@@ -96,20 +96,22 @@ def _text(name: str, value: object) -> str:
     return str(value)
 
 
-def write_parquet(path: Path, rows: Sequence[Row]) -> Path | None:
-    """The same rows, typed, unknown values null; None where pyarrow is not installed."""
+def write_parquet(path: Path, rows: Sequence[Row]) -> str:
+    """The same rows, typed, unknown values null. Returns why it could not be written: "" where it was."""
     try:
         import pyarrow
         import pyarrow.parquet
-    except ImportError:
-        return None
+    except ImportError as error:
+        path.unlink(missing_ok=True)  # an older selection's
+        return f"it needs a pyarrow that suits this numpy (pip install pyarrow): {error}"
     kinds = {"reserved": pyarrow.bool_(), "timestamp_us": pyarrow.int64()}
     texts = {"name", "dry", "wet", "split", "drive", "regime", "stratum", "hash"}
     schema = pyarrow.schema([(c, kinds.get(c, pyarrow.string() if c in texts else pyarrow.float64())) for c in COLUMNS])
     plain = [{c: _known(row[c]) for c in COLUMNS} for row in rows]
     sink = pyarrow.BufferOutputStream()
     pyarrow.parquet.write_table(pyarrow.Table.from_pylist(plain, schema=schema), sink)
-    return write_atomically(path, sink.getvalue().to_pybytes())
+    write_atomically(path, sink.getvalue().to_pybytes())
+    return ""
 
 
 def _known(value: object) -> object:
