@@ -22,6 +22,7 @@ from rainstereo.model.losses import (
     dissimilarity,
     feature_distance,
     pixel,
+    root_mean_square,
     squared,
 )
 from rainstereo.model.vgg import VggFeatures
@@ -62,6 +63,19 @@ def test_feature_distance_by_hand() -> None:
 def test_pixel_and_squared_by_hand() -> None:
     assert pixel(tensor(0, 1), tensor(0.5, 0.9)).item() == pytest.approx(0.3)
     assert squared(tensor(0, 1), tensor(0.5, 0.9)).item() == pytest.approx((0.25 + 0.01) / 4)
+
+
+def test_root_mean_square_by_hand() -> None:
+    """Of each image, then the mean over images: 0.3 and 0.1, where the root of all is 0.2236; 0 is the gradient of a
+    perfect image."""
+    clear = torch.zeros(2, 3, 4, 4, dtype=torch.float64)
+    derained = clear.clone()
+    derained[0], derained[1] = 0.3, -0.1
+    assert root_mean_square(clear, derained).item() == pytest.approx(0.2, abs=1e-5)
+    perfect = clear.clone().requires_grad_()
+    root_mean_square(clear, perfect).backward()
+    assert perfect.grad is not None
+    assert perfect.grad.abs().max() == 0
 
 
 def test_cross_entropy_is_torchs() -> None:
@@ -119,13 +133,14 @@ class Doubled(nn.Module):
 def test_generators_loss_by_hand() -> None:
     """clear 0.5, derained 0.1 everywhere: adversarial (0.3 - 1)^2; msadv 0.2 / 2 + 1.2; perceptual 0.8; pixel 0.4."""
     clear, derained = torch.full((1, 3, 11, 11), 0.5).double(), torch.full((1, 3, 11, 11), 0.1).double()
-    weights = LossWeights(2.0, 3.0, 5.0, 7.0, 11.0, 13.0)
+    weights = LossWeights(2.0, 3.0, 5.0, 7.0, 11.0, lambda_rms=17.0, lambda_ssim=13.0)
     terms = GeneratorLoss(weights, Doubled())(clear, derained, Halves())
     ssim = (2 * 0.05 + 1e-4) / (0.25 + 0.01 + 1e-4)
     expected = {
-        "adversarial": 0.49, "perceptual": 0.8, "msadv": 1.3, "pixel": 0.4, "squared": 0.08, "ssim": 1 - ssim
+        "adversarial": 0.49, "perceptual": 0.8, "msadv": 1.3, "pixel": 0.4, "squared": 0.08,
+        "rms": (0.16 + 1e-6) ** 0.5, "ssim": 1 - ssim
     }  # fmt: skip
-    expected["total"] = 2 * 0.49 + 3 * 0.8 + 5 * 1.3 + 7 * 0.4 + 11 * 0.08 + 13 * (1 - ssim)
+    expected["total"] = 2 * 0.49 + 3 * 0.8 + 5 * 1.3 + 7 * 0.4 + 11 * 0.08 + 17 * (0.16 + 1e-6) ** 0.5 + 13 * (1 - ssim)
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected)
 
 
@@ -167,7 +182,9 @@ def test_gradients(adversary: str) -> None:
     """With the networks that they are used with, small: of the generator's sum, by the derained images."""
     torch.manual_seed(0)
     discriminator = DiscriminatorConfig(base_channels=2, layers=3).build().double()
-    weights = LossWeights(lambda_perceptual=0, lambda_pixel=1, lambda_squared=1, lambda_ssim=1, adversary=adversary)
+    weights = LossWeights(
+        lambda_perceptual=0, lambda_pixel=1, lambda_squared=1, lambda_rms=1, lambda_ssim=1, adversary=adversary
+    )
     losses = GeneratorLoss(weights)
     clear, derained = images(0, 12)[:1], images(1, 12)[:1].requires_grad_()
     assert torch.autograd.gradcheck(
