@@ -188,6 +188,11 @@ class Recipe:
         _within("keep.keep", k.keep, 2, 10**6)
         for name in ("log", "checkpoint", "validate", "sheet", "val_limit", "val_crop"):
             _within(f"keep.{name}", getattr(k, name), 0, 10**9)
+        if self.discriminator.conditional and o.pool:
+            raise ValueError(
+                f"optimizer.pool is {o.pool}, but discriminator.conditional shows a derained image with the rainy one "
+                "that it was made from; set optimizer.pool to 0"
+            )
         _within("compute.threads", self.compute.threads, 0, 1024)
 
 
@@ -251,7 +256,9 @@ def _parse(kind: Any, value: object, where: str) -> Any:
         for key in value:
             if key not in hints:
                 raise ValueError(_unknown(key, where, list(hints)))
-        return kind(**{key: _parse(hints[key], inner, f"{where}.{key}" if where else key) for key, inner in value.items()})
+        return kind(
+            **{key: _parse(hints[key], inner, f"{where}.{key}" if where else key) for key, inner in value.items()}
+        )
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is types.UnionType:
         return None if value in (None, "none", []) else _parse(inner[0], value, where)

@@ -128,7 +128,8 @@ class Trainer:
             shown = torch.cat([pool.query(image[None]) for pool, image in zip(pools, derained, strict=True)])
             with self._alone(self._run_discriminator, i + 1 < len(parts)):
                 with self._casting():
-                    loss = discriminator_loss(self._run_discriminator, clear, shown) / len(parts)
+                    adversary = self.recipe.losses.adversary
+                    loss = discriminator_loss(self._run_discriminator, clear, shown, rainy, adversary) / len(parts)
                 self.scaler.scale(loss).backward()
             total += loss.detach()
         return {"discriminator": float(total)}, self._update(self.discriminator_optimizer, rate)
@@ -140,7 +141,7 @@ class Trainer:
             with self._alone(self._run_generator, i + 1 < len(parts)):
                 derained = first[i] if first else self._derained(rainy)
                 with self._casting():
-                    found = self._loss(clear, derained, self.discriminator)
+                    found = self._loss(clear, derained, self.discriminator, rainy)
                 self.scaler.scale(found["total"] / len(parts)).backward()
             for name, loss in found.items():
                 losses[name] = losses.get(name, 0) + loss.detach() / len(parts)
