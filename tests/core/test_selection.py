@@ -1,5 +1,6 @@
 """What decides which pairs become a data set: measures with known answers, and choices checked from outside."""
 
+import itertools
 import math
 from collections import Counter
 from dataclasses import replace
@@ -186,7 +187,7 @@ def test_near_duplicates_are_consecutive_frames_and_no_other_places(shared_data:
     """The threshold lies between frames 1/15 s apart and frames of other places."""
     drive = [imagefile.read(p, gray=True) for p in sorted((shared_data / "camseq01_32class_960x720/images").iterdir())]
     hashes = np.array([perceptual_hash(image) for image in drive])
-    assert max(distance(a, b) for a, b in zip(hashes[:-1], hashes[1:], strict=True)) <= NEAR_DUPLICATE - 10
+    assert max(distance(a, b) for a, b in itertools.pairwise(hashes)) <= NEAR_DUPLICATE - 10
     places = sorted((shared_data / "camvid11_480x360/train").iterdir())
     few = np.array([perceptual_hash(imagefile.read(p, gray=True)) for p in (places[0], places[75], places[149])])
     apart = [distance(few[i], few[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
@@ -362,5 +363,5 @@ def test_equal_timestamps_are_rejected() -> None:
     "bad", [{"count": 0}, {"val": 0.6, "test": 0.5}, {"reserve": 9, "count": 3}, {"split_by": "luck"}]
 )
 def test_settings_that_make_no_sense_are_refused(bad: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="expected|asked for"):
+    with pytest.raises(ValueError, match=r"expected|asked for"):
         Settings(**bad)  # type: ignore[arg-type]
