@@ -67,7 +67,8 @@ def build(seed: int, quick: bool) -> Stage:
 def _scene(name: str, cover: float, size: tuple[int, int], seed: int) -> Scene:
     rng = np.random.default_rng(seed)
     clear: Image = cv2.resize(photograph(name), size, interpolation=cv2.INTER_AREA)
-    wet, opacity = clear, np.zeros(clear.shape[:2], np.float32)
+    wet: Image = clear
+    opacity: Image = np.zeros(clear.shape[:2], np.float32)
     if cover:
         setup = preset("drops")
         rain = Rain(replace(setup, population=setup.population.with_cover(cover)), seed=seed, tolerance=math.inf)
@@ -158,8 +159,8 @@ def _choice_work(seed: int, quick: bool) -> Work:
         return float(nearest(hashes[left], hashes[rows.astype(np.intp)])[1].max())
 
     return Work(
-        "choice", f"{few} of {many} hashes", "The most different ones, against any. Hashes of a drive that stands now and then: 0 to 30 bits from one to the "
-        "next; one thread.",
+        "choice", f"{few} of {many} hashes",
+        "The most different ones, against any. Hashes of a drive that stands now and then; one thread.",
         (
             Variant("farthest_points", lambda: farthest_points(hashes, few, seed)[0], gap, True, every=5),
             Variant("at random", lambda: np.random.default_rng(seed).permutation(many)[:few], gap),
