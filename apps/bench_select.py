@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import math
+import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -112,16 +114,17 @@ def _by_difference(wet: Image, dry: Image) -> float:
 
 
 def _pair_work(scenes: Sequence[Scene], promised: bool) -> Work:
-    folder = tempfile.TemporaryDirectory(prefix="rainstereo-bench-")
+    folder = Path(tempfile.mkdtemp(prefix="rainstereo-bench-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     pairs = []
     for i, scene in enumerate(scenes):
-        paths = Path(folder.name, f"{i}_dry.png"), Path(folder.name, f"{i}_wet.png")
+        paths = folder / f"{i}_dry.png", folder / f"{i}_wet.png"
         for path, image in zip(paths, (scene.dry, scene.wet), strict=True):
             imagefile.write(path, image)
         pairs.append(Candidate(str(i), *paths, "bench", float(i)))
 
     def read() -> list[Image]:
-        return [imagefile.read(p) for p in _paths(pairs) if folder.name]  # the folder lives as long as this
+        return [imagefile.read(p) for p in _paths(pairs)]
 
     def error(found: Sequence[Measures]) -> float:
         return float(np.mean([abs(m.cover - s.cover) for m, s in zip(found, scenes, strict=True)]))
