@@ -49,6 +49,7 @@ COMMANDS: dict[str, Command] = {
         "where simple drop models are good to a pixel, and where not", "rainstereo droplets --out out/droplets"
     ),
     "rain": Command("adherent rain on any image", "rainstereo rain drive --out rainy --preset camvid --psnr 16.9"),
+    "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 
@@ -157,7 +158,7 @@ def _unknown(name: str) -> str:
 
 
 def _version_text() -> str:
-    from rainstereo.apps.record import versions
+    from rainstereo.apps.run_record import versions
 
     found = versions()
     width = max(map(len, found))
