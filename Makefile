@@ -1,5 +1,5 @@
 # Two commands are enough: `make demo` shows the toolkit at work, `make test` checks it. Both set up what they need.
-.PHONY: demo test test-py312 env lint types bench pictures weights format clean
+.PHONY: demo test firmware-test rig-test test-py312 env lint types bench pictures weights format clean
 OUT ?= out
 RUN = .venv/bin/python -m
 JOBS ?= 2
@@ -16,6 +16,12 @@ test-py312:
 	@test -n "$(PYTHON312)" || { echo "missing: python3.12 (sudo apt-get install python3.12-venv, or PYTHON312=...)"; exit 1; }
 	@.ci/environment .venv312 "$(PYTHON312)"
 	.venv312/bin/python -m pytest -n $(JOBS) tests/core tests/calib
+
+# The pump's firmware natively, as a sketch on a simulated ATmega328P, and fuzzed; installs Debian's packages for that.
+firmware-test: env
+	@.ci/firmware
+	$(RUN) pytest tests/hardware tests/apps/test_pump.py
+	$(MAKE) -C firmware fuzz
 
 env:
 	@.ci/environment .venv

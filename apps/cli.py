@@ -50,6 +50,9 @@ COMMANDS: dict[str, Command] = {
     ),
     "rain": Command("adherent rain on any image", "rainstereo rain drive --out rainy --preset camvid --psnr 16.9"),
     "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
+    "pump": Command(
+        "drive the rig's pump: status, run, schedule, stop, monitor", "rainstereo pump run mist --simulate"
+    ),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 
