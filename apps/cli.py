@@ -41,6 +41,10 @@ COMMANDS: dict[str, Command] = {
         "a recording to undistorted, cropped, aligned pairs",
         "rainstereo align --dry drive/dry --wet drive/wet --rig rig --out aligned",
     ),
+    "select": Command(
+        "aligned pairs to a data set of an exact size, split without leaks",
+        "rainstereo select aligned --count 4818 --reserve 500 --out dataset",
+    ),
     "droplets": Command(
         "where simple drop models are good to a pixel, and where not", "rainstereo droplets --out out/droplets"
     ),
