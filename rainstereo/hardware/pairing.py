@@ -98,6 +98,15 @@ class Pairer:
             return self._given_period
         return median(self._intervals) if len(self._intervals) >= 3 else None
 
+    def count_from(self, wraps: dict[Role, int | None]) -> None:
+        """The cameras' wraps, known when they are connected, for the next restart."""
+        self._wraps = wraps
+
+    @property
+    def next_id(self) -> int:
+        """Smallest number that the next pair may have."""
+        return self._last_id + 1
+
     @property
     def waiting(self) -> int:
         """Frames that wait for a partner."""
