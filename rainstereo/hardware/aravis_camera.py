@@ -44,7 +44,8 @@ class AravisCamera:
     """One camera, by its device id, serial number or address; "" takes the first that answers.
 
     rate_hz: frames a second if the camera times itself; None leaves that as the camera is set (a trigger line, say).
-    pixel_format: to ask for; None leaves it. shared_clock: the camera's timestamps are PTP's, or those of fakes.
+    pixel_format, size (width, height): to ask for; None leaves them. shared_clock: the camera's
+    timestamps are PTP's, or those of fakes.
     """
 
     free_running = True
@@ -55,6 +56,7 @@ class AravisCamera:
         *,
         rate_hz: float | None = None,
         pixel_format: str | None = None,
+        size: tuple[int, int] | None = None,
         exposure_us: float | None = None,
         shared_clock: bool = False,
         buffers: int = BUFFERS,
@@ -64,7 +66,7 @@ class AravisCamera:
         self.shared_clock = shared_clock
         self.trouble = Trouble()
         self._address, self._rate, self._format, self._exposure = address, rate_hz, pixel_format, exposure_us
-        self._buffers = buffers
+        self._buffers, self._size = buffers, size
         self._camera: Any = None
         self._stream: Any = None
         self._lost = False
@@ -81,6 +83,8 @@ class AravisCamera:
             self._lost = False
             if self._format is not None:
                 self._camera.set_pixel_format_from_string(self._format)
+            if self._size is not None:
+                self._camera.set_region(0, 0, *self._size)
             if self._exposure is not None:
                 self._camera.set_exposure_time(self._exposure)
             if self._rate is not None:
@@ -130,7 +134,7 @@ class AravisCamera:
                 return None
         host_ns = time.time_ns()
         try:
-            overruns = int(self._stream.get_statistics()[2])
+            overruns = int(self._stream.get_info_uint64_by_name("n_underruns"))
             self.trouble.overrun += max(0, overruns - self._overruns)
             self._overruns = overruns
             if buffer.get_status() != aravis.BufferStatus.SUCCESS:

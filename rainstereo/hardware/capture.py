@@ -62,19 +62,25 @@ Item = tuple[Role, CameraFrame | Exception]
 
 
 class CameraPair:
-    """Two cameras; see the module. cameras: by role. event: is told of restarts, by name and details."""
+    """Two cameras; see the module. cameras: by role. period_s, grid_s: what `Pairer` is told about triggers. event: is
+    told of restarts, by name and details."""
 
     def __init__(
         self,
         cameras: Mapping[Role, CameraSource],
         *,
         period_s: float | None = None,
+        grid_s: float | None = None,
         event: Callable[..., None] = lambda *_, **__: None,
     ) -> None:
         self.cameras = dict(cameras)
         self.event = event
         shared = all(camera.shared_clock for camera in self.cameras.values())
-        self.pairer = Pairer(shared_clock=shared, period_ns=None if period_s is None else 1e9 * period_s)
+        self.pairer = Pairer(
+            shared_clock=shared,
+            period_ns=None if period_s is None else 1e9 * period_s,
+            grid_ns=None if grid_s is None else round(1e9 * grid_s),
+        )
         self._queue: queue.Queue[Item] = queue.Queue(QUEUE)
         self._ready: list[PairFrame] = []
         self._stop = threading.Event()

@@ -55,6 +55,8 @@ class Pairer:
 
     wraps: for each camera, the number after which its counter goes on with 1; None: it does not. shared_clock: the
     device timestamps of both cameras count the same time. period_ns: between triggers; None: learnt from timestamps.
+    grid_ns: triggers are due at multiples of this on the shared clock, and timestamps are late by less (triggers that
+    PTP schedules, software that keeps time).
 
     With clocks of their own, cameras must count from the same trigger on: start the one that is triggered before the
     one that triggers. With a shared clock they may start at any time.
@@ -66,12 +68,15 @@ class Pairer:
         *,
         shared_clock: bool = False,
         period_ns: float | None = None,
+        grid_ns: int | None = None,
     ) -> None:
         self.counters: dict[Role, Counters] = {role: Counters() for role in ROLES}
         self.sync = SyncStatistics(shared_clock)
         self.pairs = 0
         self._wraps: dict[Role, int | None] = wraps or dict.fromkeys(ROLES)
-        self._shared, self._given_period = shared_clock, period_ns
+        if grid_ns is not None and not shared_clock:
+            raise ValueError("grid_ns was given; triggers lie on a grid only on a clock that both cameras share")
+        self._shared, self._given_period, self._grid = shared_clock, period_ns or grid_ns, grid_ns
         self._intervals: deque[float] = deque(maxlen=31)
         self._last_id = 0
         self.broken = ""
@@ -90,6 +95,7 @@ class Pairer:
         self._clocks = ClockComparison(self._shared)
         self._streams = {role: _Stream(self._wraps.get(role), self.counters[role]) for role in ROLES}
         self._aligned = not self._shared
+        self._origin: int | None = None  # number of which ids count on; of counters that wrap it is anything
 
     @property
     def period_ns(self) -> float | None:
@@ -111,6 +117,11 @@ class Pairer:
     def waiting(self) -> int:
         """Frames that wait for a partner."""
         return sum(len(stream.waiting) for stream in self._streams.values())
+
+    def _due_ns(self, frame: CameraFrame) -> int | None:
+        """When the frame's trigger was due, as far as its timestamp tells."""
+        at = frame.device_ts_ns
+        return at if at is None or self._grid is None else at // self._grid * self._grid
 
     def offer(self, role: Role, frame: CameraFrame) -> list[PairFrame]:
         """Take a frame and give the pairs that it completes."""
@@ -137,7 +148,7 @@ class Pairer:
     def _unwrap(self, stream: _Stream, frame: CameraFrame) -> int | None:
         """The frame's number, counted on; None where it came before."""
         if stream.raw is None:
-            stream.raw, stream.newest, stream.newest_ns = frame.id, frame.id, frame.device_ts_ns
+            stream.raw, stream.newest, stream.newest_ns = frame.id, frame.id, self._due_ns(frame)
             return frame.id
         step = frame.id - stream.raw
         expected = self._expected_step(stream, frame)
@@ -160,18 +171,19 @@ class Pairer:
             return number
         stream.counters.lost += step - 1
         stream.missing.update(range(max(stream.newest + 1, number - MOST_WAITING), number))
-        if frame.device_ts_ns is not None and stream.newest_ns is not None:
-            self._intervals.append((frame.device_ts_ns - stream.newest_ns) / step)
-        stream.raw, stream.newest, stream.newest_ns = frame.id, number, frame.device_ts_ns
+        due_ns = self._due_ns(frame)
+        if due_ns is not None and stream.newest_ns is not None:
+            self._intervals.append((due_ns - stream.newest_ns) / step)
+        stream.raw, stream.newest, stream.newest_ns = frame.id, number, due_ns
         stream.missing = {n for n in stream.missing if n > number - MOST_WAITING}
         return number
 
     def _expected_step(self, stream: _Stream, frame: CameraFrame) -> float | None:
         """By how many periods its clock went on."""
-        period = self.period_ns
-        if period is None or frame.device_ts_ns is None or stream.newest_ns is None:
+        period, due_ns = self.period_ns, self._due_ns(frame)
+        if period is None or due_ns is None or stream.newest_ns is None:
             return None
-        return (frame.device_ts_ns - stream.newest_ns) / period
+        return (due_ns - stream.newest_ns) / period
 
     def _align(self) -> bool:
         """Bring the counters of cameras with a shared clock to the same numbers; False: not enough is known yet."""
@@ -180,7 +192,7 @@ class Pairer:
         if period is None or not dry.waiting or not wet.waiting:
             return False
         a, b = min(dry.waiting), min(wet.waiting)
-        dry_ns, wet_ns = dry.waiting[a].device_ts_ns, wet.waiting[b].device_ts_ns
+        dry_ns, wet_ns = self._due_ns(dry.waiting[a]), self._due_ns(wet.waiting[b])
         if dry_ns is None or wet_ns is None:
             self.broken = "the cameras are said to share a clock, but a frame tells no time"
             self._end()
@@ -203,17 +215,27 @@ class Pairer:
             number = min(both)
             a, b = dry.waiting[number], wet.waiting[number]
             status, sync = PairStatus.UNCHECKED, float("nan")
-            if a.device_ts_ns is not None and b.device_ts_ns is not None:
-                if not self._in_step(number, a.device_ts_ns, b.device_ts_ns):
+            dry_ns, wet_ns = self._due_ns(a), self._due_ns(b)
+            if dry_ns is not None and wet_ns is not None:
+                if not self._in_step(number, dry_ns, wet_ns):
                     if self.broken:
                         return
                     continue  # the numbers were shifted
-                status, sync = PairStatus.OK, self._clocks.add(a.device_ts_ns, b.device_ts_ns)
+                status, sync = PairStatus.OK, self._clocks.add(dry_ns, wet_ns)
+                if self._shared:
+                    sync = ((b.device_ts_ns or 0) - (a.device_ts_ns or 0)) / 1e3
             del dry.waiting[number], wet.waiting[number]
+            if self._origin is None:
+                self._origin = number - 1 if dry.wrap is not None else 0
+            if dry.wrap is not None and number <= self._origin:  # before the first pair: its id is taken
+                dry.counters.unpaired += 1
+                wet.counters.unpaired += 1
+                continue
             self.sync.add(sync)
             self.pairs += 1
-            self._last_id = max(self._last_id, self._base + number)
-            yield PairFrame(self._base + number, a, b, status, sync)
+            pair_id = self._base + number - self._origin
+            self._last_id = max(self._last_id, pair_id)
+            yield PairFrame(pair_id, a, b, status, sync)
 
     def _in_step(self, number: int, dry_ns: int, wet_ns: int) -> bool:
         """Whether both clocks went on alike since the last pair. If not, numbers are shifted, or `broken` says why.
