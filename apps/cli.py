@@ -41,10 +41,15 @@ COMMANDS: dict[str, Command] = {
         "a recording to undistorted, cropped, aligned pairs",
         "rainstereo align --dry drive/dry --wet drive/wet --rig rig --out aligned",
     ),
+    "select": Command(
+        "aligned pairs to a data set of an exact size, split without leaks",
+        "rainstereo select aligned --count 4818 --reserve 500 --out dataset",
+    ),
     "droplets": Command(
         "where simple drop models are good to a pixel, and where not", "rainstereo droplets --out out/droplets"
     ),
     "rain": Command("adherent rain on any image", "rainstereo rain drive --out rainy --preset camvid --psnr 16.9"),
+    "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 
