@@ -14,8 +14,8 @@ from rainstereo.align import Alignment, plan, residual_shift
 from rainstereo.apps import overlays
 from rainstereo.apps.cli import DONE, FAILED
 from rainstereo.apps.figures import residual_field
-from rainstereo.apps.record import Record
 from rainstereo.apps.report import Report, Tile, quantity
+from rainstereo.apps.run_record import Record
 from rainstereo.pairs import Pair, match
 from rainstereo.rectify import Plane
 from rainstereo.rig import ROLES

@@ -17,7 +17,7 @@ from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedC
 
 from rainstereo.apps import bench_page
 from rainstereo.apps.bench_harness import SINGLE_THREAD, Outcome, Stage, machine, measure, steps
-from rainstereo.apps.record import Record, write_atomically
+from rainstereo.apps.run_record import Record, write_atomically
 
 STAGES: dict[str, str] = {
     "refraction": "rainstereo.apps.bench_refraction",

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from rainstereo.apps.bench_harness import Measurement, Outcome, Spread, Stage, Target
 from rainstereo.apps.canvas import to_svg
-from rainstereo.apps.record import Record, versions, write_atomically
 from rainstereo.apps.report import Cell, Report, Tile, quantity
+from rainstereo.apps.run_record import Record, versions, write_atomically
 from rainstereo.apps.tradeoff import error_against_time
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from rainstereo import Chamber
 from rainstereo.apps.calibration_page import Findings, page
 from rainstereo.apps.cli import DONE, FAILED
-from rainstereo.apps.record import Record
+from rainstereo.apps.run_record import Record
 from rainstereo.calib import checks, mrcal_versions, uncertainty
 from rainstereo.calib.board import Board
 from rainstereo.calib.cross_validation import choose_lensmodel

@@ -9,8 +9,8 @@ import numpy as np
 
 from rainstereo import Chamber, Rig
 from rainstereo.apps import figures
-from rainstereo.apps.record import Record
 from rainstereo.apps.report import Mood, Report, Tile, quantity
+from rainstereo.apps.run_record import Record
 from rainstereo.calib import uncertainty
 from rainstereo.calib.checks import Verdict
 from rainstereo.calib.cross_validation import Choice

@@ -153,7 +153,7 @@ def _unknown(name: str) -> str:
 
 
 def _version_text() -> str:
-    from rainstereo.apps.record import versions
+    from rainstereo.apps.run_record import versions
 
     found = versions()
     width = max(map(len, found))

@@ -16,8 +16,8 @@ from rainstereo import Camera, Chamber, Rig, imagefile
 from rainstereo.apps import align, calibrate, droplets, figures, overlays, rain, simulate
 from rainstereo.apps.calibrate import Clock
 from rainstereo.apps.cli import DONE
-from rainstereo.apps.record import Record
 from rainstereo.apps.report import Report, Tile
+from rainstereo.apps.run_record import Record
 from rainstereo.calib import uncertainty
 from rainstereo.calib.uncertainty import InfinityError
 from rainstereo.refraction import project

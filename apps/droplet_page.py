@@ -19,9 +19,9 @@ from rainstereo.apps.droplet_pictures import (
 )
 from rainstereo.apps.droplet_tradeoff import NEARER, plot
 from rainstereo.apps.figures import image_grid
-from rainstereo.apps.record import Record
 from rainstereo.apps.regime_figures import choice_maps, error_maps, sag_plot
 from rainstereo.apps.report import Report, Tile, quantity
+from rainstereo.apps.run_record import Record
 from rainstereo.types import Image
 
 WIDE = 640  # pixels across the picture of the whole scene

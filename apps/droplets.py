@@ -19,8 +19,8 @@ from rainstereo.apps.droplet_findings import Findings, figures
 from rainstereo.apps.droplet_pictures import blurred, defocused, rim, sharp
 from rainstereo.apps.droplet_tradeoff import timings
 from rainstereo.apps.droplet_verdict import verdict
-from rainstereo.apps.record import Record
 from rainstereo.apps.regime_maps import misuses, regime_map, sag, sweeps
+from rainstereo.apps.run_record import Record
 from rainstereo.drop_stack import DropStack
 from rainstereo.droplet import SphericalCap
 from rainstereo.scene_statistics import SceneStatistics

@@ -32,7 +32,7 @@ from rainstereo.apps.rain_settings import Rain, Size, over_set
 from rainstereo.apps.rain_sources import Source, find, refuse_overlap
 from rainstereo.apps.rain_workers import MOST_WORKERS, Crew, Numbered, Work, crew
 from rainstereo.apps.realism import realism_sheet
-from rainstereo.apps.record import Record
+from rainstereo.apps.run_record import Record
 from rainstereo.rain.severity import Met
 from rainstereo.types import Image
 

@@ -12,7 +12,7 @@ from typing import Any
 from rainstereo.apps.rain_frames import NOTES, stamp
 from rainstereo.apps.rain_settings import Rain
 from rainstereo.apps.rain_sources import Source
-from rainstereo.apps.record import versions, write_json
+from rainstereo.apps.run_record import versions, write_json
 
 
 def key_of(rain: Rain, *others: Any) -> str:

@@ -21,7 +21,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from rainstereo import imagefile
 from rainstereo.apps.rain_sources import Label, Source
-from rainstereo.apps.record import write_atomically
+from rainstereo.apps.run_record import write_atomically
 from rainstereo.rain import drop_list
 from rainstereo.rain.render import Plan
 from rainstereo.rain.severity import Met

@@ -17,8 +17,8 @@ from rainstereo.apps.rain_motion import frames
 from rainstereo.apps.rain_results import spread, values_of
 from rainstereo.apps.rain_settings import Rain
 from rainstereo.apps.rain_sources import VIDEOS
-from rainstereo.apps.record import Record
 from rainstereo.apps.report import Report, Tile, quantity
+from rainstereo.apps.run_record import Record
 from rainstereo.rain.severity import Met
 from rainstereo.types import Image
 

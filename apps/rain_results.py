@@ -11,7 +11,7 @@ import numpy as np
 
 from rainstereo.apps.rain_frames import PROTOCOL, Note
 from rainstereo.apps.rain_settings import Rain
-from rainstereo.apps.record import Record
+from rainstereo.apps.run_record import Record
 from rainstereo.rain.severity import Met
 
 KEPT = ("name", "path", "psnr", "ssim", "cover", "drops", "seconds", "trials", "share", "frames", "kept")

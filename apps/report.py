@@ -28,7 +28,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from rainstereo.apps.canvas import to_inline_svg, to_png
-from rainstereo.apps.record import Record, jsonable, write_atomically
+from rainstereo.apps.run_record import Record, jsonable, write_atomically
 from rainstereo.apps.stylesheet import CSS, ICON
 
 Image = npt.NDArray[np.uint8]

@@ -16,8 +16,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rainstereo import Rig
 from rainstereo.apps.board_poses import board_poses
 from rainstereo.apps.digital_rig import RigOptions, digital_rig
-from rainstereo.apps.record import Record
 from rainstereo.apps.report import Report, Tile, quantity
+from rainstereo.apps.run_record import Record
 from rainstereo.apps.simulation import Capture, Simulation, fingerprint_in
 from rainstereo.apps.simulation_images import MOST_WORKERS, jobs, write_images
 from rainstereo.apps.street import drive

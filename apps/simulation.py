@@ -25,7 +25,7 @@ import numpy as np
 from rainstereo import Rig
 from rainstereo.apps.board_views import board_drawing
 from rainstereo.apps.digital_rig import exact_observations
-from rainstereo.apps.record import versions, write_atomically, write_json
+from rainstereo.apps.run_record import versions, write_atomically, write_json
 from rainstereo.apps.street import LANES, street
 from rainstereo.calib.board import Board
 from rainstereo.drawing import Drawing

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from rainstereo.apps.board_views import render_board, room
-from rainstereo.apps.record import write_atomically
+from rainstereo.apps.run_record import write_atomically
 from rainstereo.apps.simulation import Simulation
 from rainstereo.pose import compose
 from rainstereo.rig import ROLES, Role

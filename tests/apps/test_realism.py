@@ -19,7 +19,7 @@ from rainstereo.apps.rain_settings import Rain
 from rainstereo.apps.realism import WORDS, Comparison, findings, realism_sheet
 from rainstereo.apps.realism_fit import Fit, Scene, fit
 from rainstereo.apps.realism_measures import FITTED, SPECK, elongation, granulometry, look, without_specks
-from rainstereo.apps.record import jsonable
+from rainstereo.apps.run_record import jsonable
 from rainstereo.rain.appearance import WINDOW
 from rainstereo.rain.population import LogNormal
 from rainstereo.types import Image, Mask

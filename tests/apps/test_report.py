@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from rainstereo.apps import figures, overlays
 from rainstereo.apps.canvas import INK, to_inline_svg, to_png, to_svg
-from rainstereo.apps.record import RESERVED, Record, jsonable, write_atomically, write_json
 from rainstereo.apps.report import Report, Tile, quantity
+from rainstereo.apps.run_record import RESERVED, Record, jsonable, write_atomically, write_json
 from rainstereo.apps.tradeoff import error_against_time
 
 VOID = {"meta", "link", "img", "input", "br", "hr"}
