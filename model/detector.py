@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from rainstereo.types import Image, Mask
+from rainstereo.types import Array, Image, Mask
 
 CELL = 16
 """Pixels along a cell's side; a multiple of every network's own cell, and of the generator's stride."""
@@ -28,7 +28,8 @@ OWN = 4
 FACTORS = (1, 2, 4)
 ROWS = 180
 """Rows that the averaged image has at least, if the image has them."""
-THRESHOLD = 0.5
+THRESHOLD = 0.15
+CERTAIN = 0.7
 MOST_BYTES = 1 << 20
 
 
@@ -69,12 +70,18 @@ class DropDetector(nn.Module):
 
 
 class Detector:
-    """Cells of an image that hold drops, or may; `Detector.shipped()` has the package's weights."""
+    """Cells of an image that hold drops, or may; `Detector.shipped()` has the package's weights.
 
-    def __init__(self, network: DropDetector, device: str | torch.device = "cpu", threshold: float = THRESHOLD) -> None:
-        if not 0 <= threshold <= 1:
-            raise ValueError(f"a threshold of {threshold} was given; expected a probability, 0 to 1")
-        self.device, self.threshold = torch.device(device), threshold
+    A drop is where the network is certain, and as far around as it finds one likelier than the threshold.
+    """
+
+    def __init__(
+        self, network: DropDetector, device: str | torch.device = "cpu", threshold: float = THRESHOLD,
+        certain: float = CERTAIN,
+    ) -> None:  # fmt: skip
+        if not 0 <= threshold <= 1 or not 0 <= certain <= 1:
+            raise ValueError(f"thresholds of {threshold} and {certain} were given; expected probabilities, 0 to 1")
+        self.device, self.threshold, self.certain = torch.device(device), threshold, max(certain, threshold)
         self.network = network.eval().to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @classmethod
@@ -87,7 +94,7 @@ class Detector:
         """With the weights in the package."""
         return cls.load(shipped(), device, threshold)
 
-    def probability(self, image: Image, factor: int | None = None) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    def probability(self, image: Image, factor: int | None = None) -> Array:
         """Of a drop in each cell, (ceil(H / CELL), ceil(W / CELL)): the largest of the network's own cells in it.
 
         image: uint8 or uint16, gray or BGR. factor: by which it is averaged down first, 1, 2 or 4; None: by its size.
@@ -99,12 +106,22 @@ class Detector:
             found = self.network(tensor.to(memory_format=torch.channels_last)).sigmoid()
             found = nn.functional.max_pool2d(found, CELL // (OWN * factor), ceil_mode=True)
         rows, columns = -(-image.shape[0] // CELL), -(-image.shape[1] // CELL)
-        return cast(np.ndarray[tuple[int, ...], np.dtype[np.float32]], found[0, 0, :rows, :columns].cpu().numpy())
+        return cast(Array, found[0, 0, :rows, :columns].cpu().numpy())
 
     def cells(self, image: Image, factor: int | None = None) -> Mask:
-        """Which cells hold a drop, at this detector's threshold; the largest of each one and its eight neighbours' is
-        not taken: a rim that reaches into a cell marks that cell itself."""
-        return cast(Mask, self.probability(image, factor) >= self.threshold)
+        """(ceil(H / CELL), ceil(W / CELL)): which cells hold a drop."""
+        return grown_from(self.probability(image, factor), self.threshold, self.certain)
+
+
+def grown_from(probability: Array, low: float, high: float) -> Mask:
+    """Where a probability is at least low, in groups of touching cells of which one has at least high."""
+    count, groups = cv2.connectedComponents((probability >= low).astype(np.uint8), connectivity=8)
+    if count == 1:
+        return np.zeros(probability.shape, bool)
+    kept = np.zeros(count, bool)
+    kept[groups[probability >= high]] = True
+    kept[0] = False
+    return np.asarray(kept[groups])
 
 
 def factor_for(height: int, width: int) -> int:
@@ -112,7 +129,7 @@ def factor_for(height: int, width: int) -> int:
     return max((f for f in FACTORS if min(height, width) >= ROWS * f), default=1)
 
 
-def _small(image: Image, factor: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+def _small(image: Image, factor: int) -> Array:
     """(ceil(H / f), ceil(W / f), 3) float32 in 0..1, BGR; a multiple of what the cells need."""
     height, width = image.shape[:2]
     bottom, right = -height % CELL, -width % CELL
@@ -123,10 +140,7 @@ def _small(image: Image, factor: int) -> np.ndarray[tuple[int, ...], np.dtype[np
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     if image.ndim == 2:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    return cast(
-        np.ndarray[tuple[int, ...], np.dtype[np.float32]],
-        np.multiply(image, np.float32(1 / np.iinfo(image.dtype).max), dtype=np.float32),
-    )
+    return cast(Array, np.multiply(image, np.float32(1 / np.iinfo(image.dtype).max), dtype=np.float32))
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
