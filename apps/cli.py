@@ -45,6 +45,7 @@ COMMANDS: dict[str, Command] = {
         "where simple drop models are good to a pixel, and where not", "rainstereo droplets --out out/droplets"
     ),
     "rain": Command("adherent rain on any image", "rainstereo rain drive --out rainy --preset camvid --psnr 16.9"),
+    "derain": Command("rain off images, videos and cameras", "rainstereo derain photo.png --out out/derained"),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 

@@ -50,7 +50,7 @@ class DetectorConfig:
 
 
 class DropDetector(nn.Module):
-    """(B, 3, H, W) RGB in 0..1, averaged down -> (B, 1, ceil(H / 4), ceil(W / 4)): logits that a drop is in the cell."""
+    """(B, 3, H, W) RGB in 0..1, averaged down -> (B, 1, ceil(H / 4), ceil(W / 4)): logits of a drop in the cell."""
 
     def __init__(self, config: DetectorConfig) -> None:
         super().__init__()
@@ -151,7 +151,7 @@ def shipped() -> Path:
     path = Path(__file__).resolve().parent / "weights" / "detector.safetensors"
     if not path.is_file():
         raise FileNotFoundError(
-            f"the drop detector's weights {path} are missing; make them with rainstereo train-detector, or give --no-skip"
+            f"the drop detector's weights {path} are missing; make them with rainstereo detector, or give --no-skip"
         )
     return path
 
@@ -170,7 +170,9 @@ def load(path: Path) -> DropDetector:
     if not path.is_file():
         raise FileNotFoundError(f"there are no detector weights at {path}")
     if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"{path} has {path.stat().st_size} bytes; expected a drop detector's weights, {MOST_BYTES} at most")
+        raise ValueError(
+            f"{path} has {path.stat().st_size} bytes; a drop detector's weights have {MOST_BYTES} at most"
+        )
     try:
         with safe_open(path, "pt") as file:
             told = dict(file.metadata() or {})

@@ -96,7 +96,7 @@ def reach(module: nn.Module) -> tuple[int, int, bool]:
 
 
 def pick_device(device: str | torch.device) -> torch.device:
-    """"auto": a CUDA device where there is one. ValueError for one that is not there."""
+    """ "auto": a CUDA device where there is one. ValueError for one that is not there."""
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -109,7 +109,7 @@ def pick_device(device: str | torch.device) -> torch.device:
 
 
 def pick_precision(precision: str, device: torch.device) -> str:
-    """"auto": bf16 where the processor or the card multiplies it in hardware, else float16 on a card, else float32."""
+    """ "auto": bf16 where the processor or the card multiplies it in hardware, else float16 on a card, else float32."""
     if precision == "auto":
         if device.type == "cuda":
             return "bf16" if torch.cuda.is_bf16_supported() else "float16"

@@ -26,7 +26,8 @@ def to_rgb(image: Image, device: torch.device) -> Tensor:
     if image.dtype == np.uint16:  # torch on the processor computes little with unsigned 16 bits
         tensor = torch.from_numpy(image.astype(np.int32)).to(device)
     else:
-        tensor = torch.from_numpy(np.ascontiguousarray(image)).to(device)
+        own = np.ascontiguousarray(image)
+        tensor = torch.from_numpy(own if own.flags.writeable else own.copy()).to(device)
     rgb = tensor.expand(3, *tensor.shape) if image.ndim == 2 else tensor.permute(2, 0, 1).flip(0)
     return rgb.float().div_(float(np.iinfo(image.dtype).max)).unsqueeze(0)
 
@@ -34,7 +35,9 @@ def to_rgb(image: Image, device: torch.device) -> Tensor:
 def from_rgb(rgb: Tensor, like: Image) -> Image:
     """(3, H, W) in 0..1 as an image of the type and channels of another; gray is the mean of the channels."""
     most = int(np.iinfo(like.dtype).max)
-    levels = rgb.float().mul(most).round_().clamp_(0, most) if like.ndim == 3 else rgb.float().mean(0).mul_(most).round_()
+    levels = (
+        rgb.float().mul(most).round_().clamp_(0, most) if like.ndim == 3 else rgb.float().mean(0).mul_(most).round_()
+    )
     if like.ndim == 3:
         levels = levels.flip(0).permute(1, 2, 0)
     levels = levels.clamp_(0, most)

@@ -34,7 +34,7 @@ MAX_PIXELS = 4 << 20
 """What is computed at once, halo included; larger images are tiled."""
 SKIP_HALO = 32
 """Pixels of the image around what holds drops that the generator sees, when the rest is skipped."""
-RAMP = 8
+RAMP = 4
 """Pixels within a marked cell over which the restored image replaces the given one."""
 OVERLAP = 32
 CALL = 8192
@@ -75,8 +75,8 @@ class Restorer:
     ) -> None:  # fmt: skip
         if halo < 0 or (tile is not None and tile < 4 * CELL) or max_pixels < 1 << 16:
             raise ValueError(
-                f"halo {halo}, tile {tile}, max_pixels {max_pixels} were given; expected a halo of 0 or more, a tile of "
-                f"at least {4 * CELL} and at least {1 << 16} pixels at once"
+                f"halo {halo}, tile {tile}, max_pixels {max_pixels} were given; expected a halo of 0 or more, a tile "
+                f"of at least {4 * CELL} and at least {1 << 16} pixels at once"
             )
         self.network = network or _network(checkpoint, device, precision, backend)
         self.detector = (detector or Detector.shipped("cpu", threshold, certain)) if skip else None
@@ -101,26 +101,27 @@ class Restorer:
             top += len(strip)
         return Restored(out, told.marked / told.calls, told.computed / (height * width))
 
-    def many(self, images: Sequence[Image]) -> list[Image]:
+    def many(self, images: Sequence[Image]) -> list[Restored]:
         """Images, restored; those of one size that are computed whole go through the generator as one batch."""
-        whole: dict[tuple[int, ...], list[int]] = {}
-        found: list[Image | None] = []
+        found: dict[int, Restored] = {}
+        whole: dict[tuple[int, ...], list[tuple[int, Mask]]] = {}
         for i, image in enumerate(images):
             check(image)
-            small = image.shape[0] * image.shape[1] <= self.max_pixels
-            cells = self.marked(image) if small and self.detector is not None else None
-            if small and (cells is None or (len(p := self.parts(cells, image)) == 1 and p[0].area == _area(image))):
-                whole.setdefault(image.shape, []).append(i)
-                found.append(None if cells is None else cells.astype(np.uint8))
+            if _area(image) > self.max_pixels:
+                found[i] = self.restored(image)
+                continue
+            cells = self.marked(image)
+            if cells.any() and self.parts(cells, image) == [_whole(image)]:
+                whole.setdefault((*image.shape, image.dtype.itemsize), []).append((i, cells))
             else:
-                found.append(self(image) if cells is None else self.with_cells(image, cells).image)
-        for numbers in whole.values():
-            batch = torch.cat([to_rgb(images[i], self.network.device) for i in numbers])
-            for i, rgb in zip(numbers, self.network(batch), strict=True):
-                own, cells = images[i], found[i]
-                restored = from_rgb(rgb, own)
-                found[i] = restored if cells is None else _pasted(own.copy(), restored, _whole(own), cells > 0)
-        return [image for image in found if image is not None]
+                found[i] = self.with_cells(image, cells)
+        for alike in whole.values():
+            batch = torch.cat([to_rgb(images[i], self.network.device) for i, _ in alike])
+            for (i, cells), rgb in zip(alike, self.network(batch), strict=True):
+                out = images[i].copy()
+                _pasted(out, from_rgb(rgb, out), _whole(out), cells)
+                found[i] = Restored(out, float(cells.mean()), 1.0)
+        return [found[i] for i in range(len(images))]
 
     def rows(
         self, read: Rows, size: tuple[int, int], told: Callable[[int, int], None] = lambda done, total: None
@@ -152,14 +153,20 @@ class Restorer:
         parts = covering(cells, CELL, self.halo, self.step, (image.shape[0], image.shape[1]), CALL)
         return [_whole(image)] if sum(part.area for part in parts) >= WHOLE * _area(image) else parts
 
-    def with_cells(self, image: Image, cells: Mask) -> Restored:
-        """The image with only these cells restored; the others are the given ones, bit for bit."""
+    def with_cells(self, image: Image, cells: Mask, base: Image | None = None) -> Restored:
+        """The image with only these cells restored; the others are the given ones, or those of a base, bit for bit."""
+        out = (image if base is None else base).copy()
         if not cells.any():
-            return Restored(image.copy(), 0.0, 0.0)
-        out, parts = image.copy(), self.parts(cells, image)
+            return Restored(out, 0.0, 0.0)
+        parts = self.parts(cells, image)
         for part in parts:
             restored = self.whole(image[part.slices])
-            top, left, bottom, right = part.top // CELL, part.left // CELL, -(-part.bottom // CELL), -(-part.right // CELL)
+            top, left, bottom, right = (
+                part.top // CELL,
+                part.left // CELL,
+                -(-part.bottom // CELL),
+                -(-part.right // CELL),
+            )
             _pasted(out, restored, part, cells[top:bottom, left:right])
         return Restored(out, float(cells.mean()), sum(part.area for part in parts) / _area(image))
 
@@ -261,6 +268,6 @@ def restores(found: checkpoints.Checkpoint) -> None:
     channels, span = data.get("channels", 3), list(data.get("range", (0, 1)))
     if channels != 3 or span != [0, 1]:
         raise ValueError(
-            f"{found.path} is for images of {channels} channels with values in {span[0]} .. {span[-1]}; photographs come "
-            "as 3 channels in 0 .. 1. Take another checkpoint"
+            f"{found.path} is for images of {channels} channels with values in {span[0]} .. {span[-1]}; photographs "
+            "come as 3 channels in 0 .. 1. Take another checkpoint"
         )

@@ -95,7 +95,7 @@ def ramped(marked: Mask, cell: int, size: tuple[int, int], ramp: int) -> Array:
 
 @dataclass(frozen=True)
 class Grid:
-    """Tiles of an image of (height, width): squares of `side` that overlap by `overlap`, each seen with `halo` around."""
+    """Tiles of an image of (height, width): squares of `side`, overlapping by `overlap`, seen with `halo` around."""
 
     size: tuple[int, int]
     side: int
@@ -138,13 +138,16 @@ Rows = Callable[[int, int], Image]
 
 
 def strips(
-    read: Rows, grid: Grid, restore: Callable[[Image], Image], told: Callable[[int, int], None] = lambda done, total: None
+    read: Rows,
+    grid: Grid,
+    restore: Callable[[Image], Image],
+    told: Callable[[int, int], None] = lambda done, total: None,
 ) -> Iterator[Image]:
     """The restored image, strip by strip from the top; only a strip of it, and of what is read, is in memory.
 
     restore: a part of the image -> the same, restored. told: tiles done, of how many.
     """
-    height, width = grid.size
+    width = grid.size[1]
     rows, columns = grid.spans(0), grid.spans(1)
     carried: Array | None = None
     done = 0
