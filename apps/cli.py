@@ -46,6 +46,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "rain": Command("adherent rain on any image", "rainstereo rain drive --out rainy --preset camvid --psnr 16.9"),
     "derain": Command("rain off images, videos and cameras", "rainstereo derain photo.png --out out/derained"),
+    "export": Command("the de-rainer as ONNX, for other programs", "rainstereo export --out derain.onnx"),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 
