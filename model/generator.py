@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from torch import Tensor, nn
-from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from rainstereo.model.convolution_blocks import (
     ACTIVATIONS,
@@ -27,8 +27,8 @@ from rainstereo.model.convolution_blocks import (
     normalisation,
     up,
 )
+from rainstereo.model.image_batch import RGB, check, padded
 
-RGB = 3
 NAMED = {
     "normalisation": NORMALISATIONS,
     "up_sampling": UP_SAMPLINGS,
@@ -189,32 +189,15 @@ class Generator(nn.Module):
 
     def with_gate(self, images: Tensor) -> tuple[Tensor, Tensor | None]:
         """The derained images, and what gated the change, (B, 1, H, W) in 0..1, where the network draws it."""
-        if images.ndim != 4 or images.shape[1] != RGB or 0 in images.shape:
-            raise ValueError(
-                f"images have shape {tuple(images.shape)}; expected (batch, 3, height, width) of at least 1 each"
-            )
-        if not images.is_floating_point():
-            raise ValueError(f"images are {images.dtype}; expected floats in 0..1: divide by the largest value")
+        check(images)
         height, width = images.shape[2:]
-        drawn = self.network(self.padded(images))[:, :, :height, :width]
+        drawn = self.network(padded(images, self.config.multiple, self.config.smallest_side))[:, :, :height, :width]
         change, gate = drawn[:, :RGB].tanh(), None
         if self.config.output_gate:
             gate = drawn[:, RGB:].sigmoid()
             change = change * gate
         derained = images + change if self.config.output_residual else (change + 1) / 2
         return (derained if self.training else derained.clamp(0, 1)), gate
-
-    def padded(self, images: Tensor) -> Tensor:
-        """Sides brought to multiples of `config.multiple`, and to `config.smallest_side`, at the right and bottom.
-
-        Mirrored where the image is large enough for that, otherwise its last row or column is repeated.
-        """
-        for axis, size in ((3, images.shape[3]), (2, images.shape[2])):
-            more = max(-size % self.config.multiple, self.config.smallest_side - size)
-            if more:
-                sides = (0, more, 0, 0) if axis == 3 else (0, 0, 0, more)
-                images = pad(images, sides, mode="reflect" if more < size else "replicate")
-        return images
 
     def network(self, images: Tensor) -> Tensor:
         """What the head draws, unbounded: (B, 3 or 4, H, W). Sides must be multiples of `config.multiple`."""
