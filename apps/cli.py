@@ -46,6 +46,10 @@ COMMANDS: dict[str, Command] = {
     ),
     "rain": Command("adherent rain on any image", "rainstereo rain drive --out rainy --preset camvid --psnr 16.9"),
     "derain": Command("rain off images, videos and cameras", "rainstereo derain photo.png --out out/derained"),
+    "evaluate": Command(
+        "how much de-raining helps: the paper's tables on your data",
+        "rainstereo evaluate restoration camvid:frames --out out/evaluation",
+    ),
     "export": Command("the de-rainer as ONNX, for other programs", "rainstereo export --out derain.onnx"),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }

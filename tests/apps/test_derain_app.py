@@ -6,7 +6,6 @@ import shutil
 import struct
 import subprocess
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from rainstereo.apps.derain_video import Reader
 from rainstereo.apps.matroska import PictureVideo
 from rainstereo.model.restore import Restorer
 from rainstereo.types import Image
-
 from tests.model.small_restorer import picture, saved
 
 FAST = ("--no-skip", "--no-sheet")
@@ -180,7 +178,10 @@ def test_big_images_that_are_damaged_are_reported(weights: Path, tmp_path: Path)
     assert [Path(row["path"]).name for row in found["trouble"]] == ["a.ppm", "bomb.png"]
     assert "truncated" in found["trouble"][0]["reason"]
     assert "expected at most" in found["trouble"][1]["reason"]
-    assert sorted(p.name for p in (tmp_path / "out").iterdir() if not p.name.startswith(".")) == ["good.png", "report.json"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir() if not p.name.startswith(".")) == [
+        "good.png",
+        "report.json",
+    ]
 
 
 # -- videos ------------------------------------------------------------------------------------------------------------
@@ -335,10 +336,9 @@ class Camera:
 
 
 @pytest.fixture
-def camera(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def camera(monkeypatch: pytest.MonkeyPatch) -> None:
     real = cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", lambda what: Camera(what) if isinstance(what, int) else real(what))
-    yield
 
 
 @pytest.mark.usefixtures("camera")

@@ -16,7 +16,6 @@ from rainstereo.model.pixels import from_rgb, to_rgb
 from rainstereo.model.restore import Restorer
 from rainstereo.model.tiles import Grid, Rect, covering, ramped, strips
 from rainstereo.types import Image
-
 from tests.model.small_restorer import CONFIG, RedDetector, generator, network, picture, saved, with_drop
 
 
@@ -111,7 +110,10 @@ def test_rectangles_hold_every_marked_cell_and_its_halo(seed: int, share: float,
     for row, column in np.argwhere(marked):
         cell = Rect(row * 16, column * 16, min(205, row * 16 + 16), min(333, column * 16 + 16))
         assert any(
-            p.top <= (c := cell.grown(halo, size)).top and p.left <= c.left and p.bottom >= c.bottom and p.right >= c.right
+            p.top <= (c := cell.grown(halo, size)).top
+            and p.left <= c.left
+            and p.bottom >= c.bottom
+            and p.right >= c.right
             for p in parts
         )
         assert held[cell.slices].all()
@@ -176,8 +178,10 @@ def test_bad_images_and_settings_are_refused() -> None:
     for more in ({"halo": -1}, {"tile": 8}, {"max_pixels": 5}):
         with pytest.raises(ValueError, match="expected a halo"):
             restorer(**more)
-    with pytest.raises(ValueError, match="torch finds no CUDA") if not torch.cuda.is_available() else pytest.raises(
-        ValueError, match="unknown"
+    with (
+        pytest.raises(ValueError, match="torch finds no CUDA")
+        if not torch.cuda.is_available()
+        else pytest.raises(ValueError, match="unknown")
     ):
         Restorer(None, "cuda" if not torch.cuda.is_available() else "abacus", skip=False)
     with pytest.raises(ValueError, match="expected torch or onnx"):
