@@ -115,7 +115,7 @@ def _size(path: Path) -> tuple[int, int] | None:
 
 
 def _tiff(path: Path) -> tuple[tuple[int, int], BigImage | None] | None:
-    """(height, width) of a TIFF file's first page, and its samples where they lie one after the other; None: no TIFF."""
+    """(height, width) of a TIFF's first page, and its samples where they lie one after the other; None: no TIFF."""
     import tifffile
 
     try:

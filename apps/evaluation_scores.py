@@ -127,7 +127,7 @@ def _known(path: Path, key: str, sample: Sample) -> Note | None:
             note[state] = {m: math.nan if note[state][m] is None else note[state][m] for m in METRICS}
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return note if same else None
+    return {k: v for k, v in note.items() if k not in ("key", "stamps")} if same else None
 
 
 def _stamps(sample: Sample) -> list[list[int]]:

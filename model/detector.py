@@ -85,14 +85,18 @@ class Detector:
         self.network = network.eval().to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @classmethod
-    def load(cls, path: Path, device: str | torch.device = "cpu", threshold: float = THRESHOLD) -> Detector:
+    def load(
+        cls, path: Path, device: str | torch.device = "cpu", threshold: float = THRESHOLD, certain: float = CERTAIN
+    ) -> Detector:
         """From NAME.safetensors; ValueError where that is no detector's weights, or damaged."""
-        return cls(load(path), device, threshold)
+        return cls(load(path), device, threshold, certain)
 
     @classmethod
-    def shipped(cls, device: str | torch.device = "cpu", threshold: float = THRESHOLD) -> Detector:
+    def shipped(
+        cls, device: str | torch.device = "cpu", threshold: float = THRESHOLD, certain: float = CERTAIN
+    ) -> Detector:
         """With the weights in the package."""
-        return cls.load(shipped(), device, threshold)
+        return cls.load(shipped(), device, threshold, certain)
 
     def probability(self, image: Image, factor: int | None = None) -> Array:
         """Of a drop in each cell, (ceil(H / CELL), ceil(W / CELL)): the largest of the network's own cells in it.
@@ -170,9 +174,7 @@ def load(path: Path) -> DropDetector:
     if not path.is_file():
         raise FileNotFoundError(f"there are no detector weights at {path}")
     if path.stat().st_size > MOST_BYTES:
-        raise ValueError(
-            f"{path} has {path.stat().st_size} bytes; a drop detector's weights have {MOST_BYTES} at most"
-        )
+        raise ValueError(f"{path} has {path.stat().st_size} bytes; a drop detector's weights have {MOST_BYTES} at most")
     try:
         with safe_open(path, "pt") as file:
             told = dict(file.metadata() or {})

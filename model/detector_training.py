@@ -113,7 +113,7 @@ def rendered(
     images: Sequence[Image], rains: Sequence[RandomAdherentRain], count: int, size: tuple[int, int],
     draws: np.random.Generator, told: Told = lambda what, done, total: None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Rainy crops, (count, 3, H, W) uint8 RGB, and labels, (count, 1, H / 4, W / 4) bool: a visible drop in the cell."""
+    """Rainy crops, (count, 3, H, W) uint8 RGB, and labels, (count, 1, H / 4, W / 4): a visible drop there."""
     pool, labels = [], []
     for number in range(count):
         clear = _as_tensor(spoiled(crop(images, size, draws), draws) if number % 4 == 3 else crop(images, size, draws))
