@@ -41,6 +41,10 @@ COMMANDS: dict[str, Command] = {
         "a recording to undistorted, cropped, aligned pairs",
         "rainstereo align --dry drive/dry --wet drive/wet --rig rig --out aligned",
     ),
+    "select": Command(
+        "aligned pairs to a data set of an exact size, split without leaks",
+        "rainstereo select aligned --count 4818 --reserve 500 --out dataset",
+    ),
     "droplets": Command(
         "where simple drop models are good to a pixel, and where not", "rainstereo droplets --out out/droplets"
     ),
@@ -51,6 +55,7 @@ COMMANDS: dict[str, Command] = {
         "rainstereo evaluate restoration camvid:frames --out out/evaluation",
     ),
     "export": Command("the de-rainer as ONNX, for other programs", "rainstereo export --out derain.onnx"),
+    "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 

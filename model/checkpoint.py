@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -21,7 +22,7 @@ from safetensors.torch import load as parse_tensors
 from safetensors.torch import save as tensor_bytes
 from torch import Tensor, nn
 
-from rainstereo.model.architectures import build
+from rainstereo.model.architecture import configure
 from rainstereo.model.card import Card, from_toml, to_toml
 
 SUFFIX = ".safetensors"
@@ -46,16 +47,19 @@ class Checkpoint:
 
     @property
     def architecture(self) -> str:
-        """The network's name, as in `architectures`."""
+        """The network's name, as in `architecture`."""
         return str(self.card.get("architecture", ""))
 
     @property
-    def config(self) -> Card:
-        """The network's configuration: plain values, as `architectures.build` takes them."""
-        config = self.card.get("config", {})
-        if not isinstance(config, dict):
-            raise DamagedCheckpointError(f"{self.path}: the card's `config` is no table")
-        return config
+    def config(self) -> Any:
+        """The network's configuration, such as a `GeneratorConfig`; DamagedCheckpointError where the card has none."""
+        values = self.card.get("config")
+        if not isinstance(values, dict):
+            raise DamagedCheckpointError(f"{self.path}: the card has no table `config`")
+        try:
+            return configure(self.architecture, values)
+        except (ValueError, TypeError) as error:
+            raise DamagedCheckpointError(f"{self.path}: {error}; a newer rainstereo may know it") from error
 
     def build(self) -> nn.Module:
         """The network with these weights, in eval mode, on the processor.
@@ -63,7 +67,7 @@ class Checkpoint:
         DamagedCheckpointError where the tensors are not those of the network that the card describes.
         """
         with torch.random.fork_rng(devices=[]):  # initial weights are drawn, and thrown away
-            module = build(self.architecture, self.config)
+            module: nn.Module = self.config.build()
         own = module.state_dict()
         wrong = sorted(own.keys() ^ self.tensors.keys()) or sorted(
             name for name, tensor in own.items() if tensor.shape != self.tensors[name].shape

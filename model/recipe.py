@@ -13,6 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from rainstereo.model.discriminator import DiscriminatorConfig
+from rainstereo.model.losses import LossWeights
+
 
 @dataclass(frozen=True)
 class Source:
@@ -82,22 +85,6 @@ class AugmentOptions:
 
 
 @dataclass(frozen=True)
-class LossOptions:
-    """Weights (lambdas) of the losses; one whose weight is 0 is not computed.
-
-    pixel: mean absolute difference. ssim: 1 - SSIM. vgg: file of VGG-19 weights; without it features are random, and
-    labelled so.
-    """
-
-    adversarial: float = 1.0
-    perceptual: float = 1.0
-    features: float = 1.0
-    pixel: float = 0.0
-    ssim: float = 0.0
-    vgg: str = ""
-
-
-@dataclass(frozen=True)
 class OptimizerOptions:
     """Adam, for both networks.
 
@@ -154,18 +141,24 @@ class KeepOptions:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A run: it ends after `steps`, or, if that comes first, after so many `minutes` (0: no limit)."""
+    """A run: it ends after `steps`, or, if that comes first, after so many `minutes` (0: no limit).
+
+    architecture, network: the generator's name in `architecture` and its options. losses: lambdas, see `losses`; the
+    discriminator is trained only where they need it. vgg: file of VGG-19 weights for the perceptual loss; without it
+    features are random, and labelled so. name, notes: for the card.
+    """
 
     seed: int = 0
     steps: int = 200_000
     minutes: float = 0.0
-    architecture: str = "derain"
+    architecture: str = "generator"
     data: DataOptions = field(default_factory=DataOptions)
     rain: RainOptions = field(default_factory=RainOptions)
     augment: AugmentOptions = field(default_factory=AugmentOptions)
     network: Mapping[str, Any] = field(default_factory=dict)
-    discriminator: Mapping[str, Any] = field(default_factory=dict)
-    losses: LossOptions = field(default_factory=LossOptions)
+    discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
+    losses: LossWeights = field(default_factory=LossWeights)
+    vgg: str = ""
     optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
     compute: ComputeOptions = field(default_factory=ComputeOptions)
     keep: KeepOptions = field(default_factory=KeepOptions)
@@ -195,10 +188,11 @@ class Recipe:
         _within("keep.keep", k.keep, 2, 10**6)
         for name in ("log", "checkpoint", "validate", "sheet", "val_limit", "val_crop"):
             _within(f"keep.{name}", getattr(k, name), 0, 10**9)
-        for name in ("adversarial", "perceptual", "features", "pixel", "ssim"):
-            _within(f"losses.{name}", getattr(self.losses, name), 0, 1e9)
-        if not any(getattr(self.losses, n) for n in ("adversarial", "perceptual", "features", "pixel", "ssim")):
-            raise ValueError("every weight in [losses] is 0, so nothing would be learnt; set one")
+        if self.discriminator.conditional and o.pool:
+            raise ValueError(
+                f"optimizer.pool is {o.pool}, but discriminator.conditional shows a derained image with the rainy one "
+                "that it was made from; set optimizer.pool to 0"
+            )
         _within("compute.threads", self.compute.threads, 0, 1024)
 
 
@@ -242,8 +236,7 @@ def located(recipe: Recipe, folder: Path) -> Recipe:
     data = dataclasses.replace(
         recipe.data, train=tuple(map(source, recipe.data.train)), val=tuple(map(source, recipe.data.val))
     )
-    losses = dataclasses.replace(recipe.losses, vgg=at(recipe.losses.vgg))
-    return dataclasses.replace(recipe, data=data, losses=losses)
+    return dataclasses.replace(recipe, data=data, vgg=at(recipe.vgg))
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
@@ -263,7 +256,9 @@ def _parse(kind: Any, value: object, where: str) -> Any:
         for key in value:
             if key not in hints:
                 raise ValueError(_unknown(key, where, list(hints)))
-        return kind(**{key: _parse(hints[key], inner, f"{where}.{key}" if where else key) for key, inner in value.items()})
+        return kind(
+            **{key: _parse(hints[key], inner, f"{where}.{key}" if where else key) for key, inner in value.items()}
+        )
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is types.UnionType:
         return None if value in (None, "none", []) else _parse(inner[0], value, where)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -56,16 +57,40 @@ def decode(data: bytes, *, gray: bool = False) -> Image:
     return image
 
 
-def write(path: str | os.PathLike[str], image: Image) -> None:
-    """Write an image in the format of the file's suffix; the file appears under its name only when it is whole."""
-    path = Path(path)
-    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1] if path.suffix.lower() == ".png" else []
-    done, data = cv2.imencode(path.suffix, image, fast)
+def encode(suffix: str, image: Image, parameters: Sequence[int] = ()) -> bytes:
+    """The bytes of an image file. parameters: OpenCV's `imencode` flags and values; PNG is fast (level 1) without any."""
+    if not parameters and suffix.lower() == ".png":
+        parameters = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+    done, data = cv2.imencode(suffix, image, parameters)
     if not done:
-        raise ValueError(f"{path}: OpenCV cannot write {image.dtype} {image.shape} as {path.suffix}")
+        raise ValueError(f"OpenCV cannot write {image.dtype} {image.shape} as {suffix}")
+    return data.tobytes()
+
+
+def write(path: str | os.PathLike[str], image: Image, parameters: Sequence[int] = ()) -> None:
+    """Write an image in the format of the file's suffix; the file appears under its name only when it is whole."""
+    write_bytes(path, encode(Path(path).suffix, image, parameters))
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a file that appears under its name only when it is whole; OSError, naming it, where it cannot be."""
+    path = Path(path)
     partial = path.with_name(f".{path.name}.partial")
     try:
-        partial.write_bytes(data.tobytes())
+        partial.write_bytes(data)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def is_whole(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is there and ends as its format does; cheap, and enough for files that `write` made."""
+    try:
+        with Path(path).open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - 16, 0))
+            end = file.read()
+    except OSError:
+        return False
+    ending = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}.get(Path(path).suffix.lower(), b"")
+    return bool(end) and ending in end

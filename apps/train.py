@@ -1,0 +1,167 @@
+"""`rainstereo train`: a de-raining network from a recipe, on this machine's processor or GPUs; it goes on after any end."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from rainstereo.apps.run_record import Record
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rainstereo.model.dataset import Sample
+    from rainstereo.model.train import Run
+    from rainstereo.model.train_step import Stepped
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train a de-raining network as a recipe says. What the recipe leaves out is as in the paper.
+
+    A run that was interrupted, even by kill -9, goes on from its latest checkpoint when it is repeated, and finds the same
+    losses as if nothing had happened. On several GPUs: torchrun --nproc-per-node 4 -m rainstereo.apps.cli train RECIPE.
+    See docs/training.md.
+    """
+
+    recipe: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECIPE.toml")]
+    """TOML file; [[data.train]] is all that it must have."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder of the run; default: out/train/NAME, as the recipe's file is named."""
+
+
+def run(options: Options) -> int:
+    """Train; 0 when the recipe's end was reached."""
+    from rainstereo.model.recipe import read
+    from rainstereo.model.train import fit
+
+    recipe = read(options.recipe)
+    out = Path("out/train") / options.recipe.stem if options.out is None else options.out
+    first = int(os.environ.get("RANK", "0")) == 0
+    record = Record("train", options, seed=recipe.seed)
+    watcher = Watcher(Console(stderr=True, quiet=not first))
+    with watcher:
+        done = fit(recipe, out, watcher)
+    if first:
+        note(record, done, watcher)
+        record.write(out / "report.json")
+        words = f", {done.latest['psnr']:.2f} dB from {done.latest['psnr_raw']:.2f}" if done.latest else ""
+        watcher.console.print(f"{done.trainer.done} steps{words}: {out / 'model.safetensors'}", soft_wrap=True)
+    return 0
+
+
+def note(record: Record, done: Run, watcher: Watcher) -> None:
+    """What a run did, for its report."""
+    steps = done.trainer.done - done.begun_at
+    record["steps"] = done.trainer.done
+    record["steps_before"] = done.begun_at
+    record["training_s"] = done.elapsed
+    record["images_per_s"] = watcher.images_per_second
+    record["waited_for_data_s"] = done.waited
+    record["waited_for_data_share"] = done.waited / watcher.seconds if steps and watcher.seconds else None
+    record["skipped"] = done.trainer.skipped
+    record["skipped_images"] = done.unlearnt
+    record["losses"] = watcher.losses
+    record["validation"] = done.latest
+    record["best_psnr"] = done.best
+    record["parameters"] = sum(p.numel() for p in done.trainer.generator.parameters())
+    record["perceptual_features"] = done.trainer.features
+
+
+class Watcher:
+    """Shows how a run goes: losses, images a second, time left."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        columns = (
+            TextColumn("train"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[words]}"), TimeElapsedColumn(),
+        )  # fmt: skip
+        self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self._task: TaskID | None = None
+        self._started = self._told = time.monotonic()
+        self._images = 0
+        self.losses: dict[str, float] = {}
+        """Running means over some 50 steps."""
+        self.seconds = 0.0
+
+    def __enter__(self) -> Watcher:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    @property
+    def images_per_second(self) -> float:
+        """Windows learnt from, over the time since the first step began."""
+        return self._images / self.seconds if self.seconds else 0.0
+
+    def began(self, run: Run) -> None:
+        """Say what it is that begins."""
+        recipe, trainer = run.recipe, run.trainer
+        count = sum(p.numel() for p in trainer.generator.parameters())
+        self.console.print(
+            f"{recipe.architecture}, {count / 1e6:.2f} M parameters, on {trainer.device}"
+            f"{f' x {trainer.world}' if trainer.world > 1 else ''}; {len(run.items)} training images, "
+            f"{len(run.validation)} for validation",
+            highlight=False,
+        )
+        if recipe.losses.lambda_perceptual:
+            self.console.print(f"perceptual loss: {trainer.features}", highlight=False)
+        self._task = self._bar.add_task("train", total=recipe.steps, completed=trainer.done, words="")
+        self._started = self._told = time.monotonic()
+
+    def stepped(self, run: Run, found: Stepped) -> None:
+        """Move the bar; where there is no terminal, a line now and then."""
+        now = time.monotonic()
+        self._images += run.recipe.optimizer.batch
+        self.seconds = now - self._started
+        for name, value in found.losses.items():
+            self.losses[name] = value if name not in self.losses else 0.98 * self.losses[name] + 0.02 * value
+        if found.skipped:
+            self.console.print(f"step {run.trainer.done} skipped: {found.skipped}", highlight=False)
+        words = self.words(run)
+        if self._task is not None:
+            self._bar.update(self._task, completed=run.trainer.done, words=words)
+        if not self.console.is_terminal and now - self._told >= 30:
+            self._told = now
+            self.console.print(f"step {run.trainer.done}/{run.recipe.steps}  {words}", highlight=False, soft_wrap=True)
+
+    def words(self, run: Run) -> str:
+        """Losses, speed and time left."""
+        losses = "  ".join(f"{name} {value:.4f}" for name, value in self.losses.items() if name != "total")
+        share = run.progress
+        begun = run.begun_at / run.recipe.steps
+        left = self.seconds * (1 - share) / (share - begun) if share > begun else float("nan")
+        if run.recipe.minutes:
+            left = min(left, 60 * run.recipe.minutes - run.elapsed)
+        return f"{losses}  {self.images_per_second:.2f} images/s  {clock(left)} left"
+
+    def validated(self, run: Run, found: Mapping[str, float], samples: list[tuple[Sample, Tensor]]) -> None:
+        """A line."""
+        del samples
+        self.console.print(
+            f"step {run.trainer.done}: {found['psnr']:.2f} dB from {found['psnr_raw']:.2f}, mean of {found['images']:.0f} "
+            f"held-out images{', the best so far' if found['psnr'] >= run.best else ''}",
+            highlight=False,
+        )
+
+    def said(self, words: str) -> None:
+        """A line."""
+        self.console.print(words, highlight=False, soft_wrap=True)
+
+
+def clock(seconds: float) -> str:
+    """H:MM:SS."""
+    if not seconds >= 0:
+        return "-:--:--"
+    minutes, rest = divmod(int(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
