@@ -21,7 +21,6 @@ test-py312:
 firmware-test: env
 	@.ci/firmware
 	$(RUN) pytest tests/hardware tests/apps/test_pump.py
-	$(MAKE) -C firmware fuzz
 
 env:
 	@.ci/environment .venv
