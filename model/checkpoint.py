@@ -82,7 +82,11 @@ class Checkpoint:
 
 
 def save(
-    path: Path_, tensors: nn.Module | Mapping[str, Tensor], card: Mapping[str, object], *, storage: torch.dtype | None = None
+    path: Path_,
+    tensors: nn.Module | Mapping[str, Tensor],
+    card: Mapping[str, object],
+    *,
+    storage: torch.dtype | None = None,
 ) -> Path:
     """Write a module's weights, or tensors by name, and their card; return the path of the .safetensors file.
 

@@ -6,6 +6,7 @@ Window number n is the same whatever the number of workers, processes or restart
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -173,6 +174,8 @@ class Steps(Sampler[list[int]]):
 
 def loader(windows: Windows, steps: Steps, workers: int, pin: bool = False) -> DataLoader[Sample]:
     """Batches of `steps`, read ahead by worker processes."""
+    if workers:
+        multiprocessing.set_forkserver_preload(["rainstereo.model.dataset"])
     generator = torch.Generator()  # the loader's own, so that torch's stays as it is
     return DataLoader(
         windows, batch_sampler=steps, num_workers=workers, collate_fn=collate, generator=generator, pin_memory=pin,
@@ -204,7 +207,10 @@ def whole(item: Item, rain: Rain | None, seed: int, crop: int = 0) -> Sample:
     image = read(item.clear)
     clear = tensor(_part(image, np.random.default_rng([seed, WHOLE])))
     rainy, mask = rain(clear, seed, image.shape[1])
-    parts = [torch.from_numpy(_middle(t.numpy().transpose(1, 2, 0), crop).transpose(2, 0, 1).copy()) for t in (rainy, clear, mask)]
+    parts = [
+        torch.from_numpy(_middle(t.numpy().transpose(1, 2, 0), crop).transpose(2, 0, 1).copy())
+        for t in (rainy, clear, mask)
+    ]
     return Sample(*parts, seed, item.name)
 
 

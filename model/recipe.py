@@ -115,7 +115,8 @@ class OptimizerOptions:
 class ComputeOptions:
     """How it is computed. device: "auto" takes a GPU if there is one.
 
-    precision: "bf16" and "fp16" are autocast. compile: torch.compile of the generator. threads: of this process; 0:
+    precision: "bf16" and "fp16" are autocast. channels_last: where it is right, see
+    `train_step.instance_norm_differentiates`. compile: torch.compile of the generator. threads: of this process; 0:
     torch's choice.
     """
 
@@ -273,7 +274,9 @@ def _parse(kind: Any, value: object, where: str) -> Any:
         for key in value:
             if key not in hints:
                 raise ValueError(_unknown(key, where, list(hints)))
-        return kind(**{key: _parse(hints[key], inner, f"{where}.{key}" if where else key) for key, inner in value.items()})
+        return kind(
+            **{key: _parse(hints[key], inner, f"{where}.{key}" if where else key) for key, inner in value.items()}
+        )
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is types.UnionType:
         return None if value in (None, "none", []) else _parse(inner[0], value, where)

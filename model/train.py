@@ -121,7 +121,10 @@ def _fit(recipe: Recipe, out: Path, listener: Listener, rank: int, world: int, d
         if found.skipped:
             _count_skipped(run, batch, found, in_a_row)
         if _due(done, recipe.keep.log) or done == recipe.steps:
-            log.add({"step": done, "elapsed_s": round(run.elapsed, 3), "rate": run.trainer.rate(run.progress)} | found.losses)
+            log.add(
+                {"step": done, "elapsed_s": round(run.elapsed, 3), "rate": run.trainer.rate(run.progress)}
+                | found.losses
+            )
         listener.stepped(run, found)
         if _due(done, recipe.keep.validate):
             validator.look()

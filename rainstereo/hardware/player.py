@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from .frame import Event
 from .pump import WATCHDOG_MS, Pump
-from .schedule import Planned
 from .pump_log import SegmentLog
+from .schedule import Planned
 
 
 @dataclass(frozen=True)
