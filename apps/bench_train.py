@@ -1,4 +1,5 @@
-"""Benchmark stage `train`: our training step beside a plain PyTorch loop with the same networks, and reading of data."""
+"""Benchmark stage `train`: our training step beside a plain PyTorch loop with the same networks, and reading of
+data."""
 
 from __future__ import annotations
 
@@ -35,13 +36,15 @@ def build(seed: int, quick: bool) -> Stage:
         "training",
         f"{STEPS} steps on windows of {side} x {side}, batch 2, the paper's generator and discriminator with "
         f"{base} base channels, beside a loop written out in plain PyTorch; and how long the data takes.",
-        (_step_work("pixel", PIXELS, side, base, seed, not quick), _step_work("adversarial", PAPER, side, base, seed, not quick),
+        (_step_work("pixel", PIXELS, side, base, seed, not quick),
+         _step_work("adversarial", PAPER, side, base, seed, not quick),
          _data_work(side, base, seed, not quick)),
         {"window": side, "batch": 2, "base channels": base, "seed": seed},
         (
-            "The plain loop has Adam, the losses and the pool of ours, and neither checks for values that are not finite, nor "
-            "seeds, schedules or counts.",
-            "Data is read and augmented by another process while a step computes; it holds training up where it takes longer.",
+            "The plain loop has Adam, the losses and the pool of ours, and neither checks for values that are not "
+            "finite, nor seeds, schedules or counts.",
+            "Data is read and augmented by another process while a step computes; it holds training up where it takes "
+            "longer.",
         ),
     )  # fmt: skip
 
@@ -65,10 +68,10 @@ def _step_work(name: str, weights: dict[str, float], side: int, base: int, seed:
     trainer, plain = Trainer(recipe, torch.device("cpu")), _plain(recipe)
 
     def ours() -> float:
-        return [trainer.step(batch, 0.0).losses["total"] for _ in range(STEPS)][0]
+        return next(trainer.step(batch, 0.0).losses["total"] for _ in range(STEPS))
 
     def theirs() -> float:
-        return [plain(batch) for _ in range(STEPS)][0]
+        return next(plain(batch) for _ in range(STEPS))
 
     first = _plain(recipe)(batch)
     titles = {"pixel": "Mean absolute difference alone", "adversarial": "Adversarial and discriminator-feature losses"}

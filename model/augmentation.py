@@ -25,8 +25,8 @@ class Augmentation:
         low, high = o.scale
         if not (0 <= o.flip <= 1 and 0 <= o.rotate <= 180 and 0.1 <= low <= high <= 10 and 0 <= o.noise <= 1):
             raise ValueError(
-                f"[augment] flip {o.flip}, rotate {o.rotate}, scale {o.scale}, noise {o.noise}; expected 0 to 1, 0 to 180 "
-                "degrees, 0.1 <= smallest <= largest <= 10, 0 to 1"
+                f"[augment] flip {o.flip}, rotate {o.rotate}, scale {o.scale}, noise {o.noise}; expected 0 to 1, 0 to "
+                "180 degrees, 0.1 <= smallest <= largest <= 10, 0 to 1"
             )
         both: list[Any] = []
         if o.flip:
@@ -41,7 +41,8 @@ class Augmentation:
         )
 
     def __call__(self, rainy: Tensor, clear: Tensor, mask: Tensor, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The same of a rainy image and its truth, (3, H, W), and a mask, (1, H, W); torch's generator stays as it was."""
+        """The same of a rainy image and its truth, (3, H, W), and a mask, (1, H, W); torch's generator stays as it
+        was."""
         if self.both is None and self.rainy is None:
             return rainy, clear, mask
         with torch.random.fork_rng(devices=[]):

@@ -1,4 +1,5 @@
-"""Cards: small TOML texts that say what a file of weights is. Read by tomllib, written here, since Python only reads."""
+"""Cards: small TOML texts that say what a file of weights is. Read by tomllib, written here, since Python only
+reads."""
 
 from __future__ import annotations
 

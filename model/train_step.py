@@ -1,4 +1,5 @@
-"""One step of training: the discriminator first, then the generator, each from its own losses and for its own weights."""
+"""One step of training: the discriminator first, then the generator, each from its own losses and for its own
+weights."""
 
 from __future__ import annotations
 
@@ -64,7 +65,8 @@ class Trainer:
         if recipe.losses.need_discriminator:
             if recipe.discriminator.conditional and recipe.optimizer.pool:
                 raise ValueError(
-                    "discriminator.conditional needs optimizer.pool = 0: images from a pool are not of the rainy image's scene"
+                    "discriminator.conditional needs optimizer.pool = 0: images from a pool are not of the rainy "
+                    "image's scene"
                 )
             self.discriminator = self._placed(recipe.discriminator.build())
             self.discriminator_optimizer = self._adam(self.discriminator)
@@ -134,7 +136,7 @@ class Trainer:
             with self._alone(self._run_discriminator, i + 1 < len(parts)):
                 with self._casting():
                     loss = self._discriminated(clear, shown, rainy) / len(parts)
-                self.scaler.scale(loss).backward()
+                self.scaler.scale(loss).backward()  # type: ignore[no-untyped-call]
             total += loss.detach()
         return {"discriminator": float(total)}, self._update(self.discriminator_optimizer, rate)
 
@@ -171,7 +173,9 @@ class Trainer:
 
     def _placed(self, module: nn.Module) -> nn.Module:
         module = module.to(self.device)
-        return module.to(memory_format=self._format) if self._format is torch.channels_last else module  # type: ignore[call-overload]
+        if self._format is torch.channels_last:
+            module.to(memory_format=self._format)  # type: ignore[call-overload]
+        return module
 
     def _may_be_channels_last(self) -> bool:
         """Whether it is asked for, and right: see `instance_norm_differentiates`."""
@@ -245,8 +249,8 @@ class Trainer:
         decay = min(self.recipe.optimizer.ema, (1 + self.done) / (10 + self.done))
         for mean, weight in zip(self.average.parameters(), self.generator.parameters(), strict=True):
             mean.lerp_(weight, 1 - decay)
-        for mean, buffer in zip(self.average.buffers(), self.generator.buffers(), strict=True):
-            mean.copy_(buffer)
+        for kept, buffer in zip(self.average.buffers(), self.generator.buffers(), strict=True):
+            kept.copy_(buffer)
 
     # -- exact resume --------------------------------------------------------------------------------------------------
 
@@ -303,7 +307,7 @@ def instance_norm_differentiates(device: torch.device) -> bool:
     found = []
     for order in (torch.contiguous_format, torch.channels_last):
         images = values.clone(memory_format=order).requires_grad_()
-        nn.functional.instance_norm(images).backward(slopes.clone(memory_format=order))
+        nn.functional.instance_norm(images).backward(slopes.clone(memory_format=order))  # type: ignore[no-untyped-call]
         found.append(images.grad)
     return bool(torch.allclose(found[0], found[1], atol=1e-4))  # type: ignore[arg-type]
 
@@ -336,7 +340,6 @@ def _restore_optimizer(prefix: str, optimizer: torch.optim.Optimizer, tensors: M
         parameter = parameters[int(index)]
         if tensor.shape == parameter.shape:
             kept = torch.empty_like(parameter, dtype=tensor.dtype, memory_format=torch.preserve_format)
-            tensor = kept.detach().copy_(tensor)
+            optimizer.state[parameter][key] = kept.detach().copy_(tensor)
         else:
-            tensor = tensor.clone()
-        optimizer.state[parameter][key] = tensor
+            optimizer.state[parameter][key] = tensor.clone()

@@ -37,7 +37,7 @@ def test_comes_back(saved):
 
 
 def test_half_precision_is_half_the_size(saved, tmp_path):
-    module, path = saved
+    module, _path = saved
     half = checkpoint.save(tmp_path / "half", module, CARD, storage=torch.float16)
     found = checkpoint.load(half)
     for name, tensor in module.state_dict().items():

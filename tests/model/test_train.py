@@ -206,7 +206,7 @@ def test_psnr_by_hand():
     assert psnr(a, a) == 99
 
 
-# -- other processes -------------------------------------------------------------------------------------------------------
+# -- other processes ---------------------------------------------------------------------------------------------
 
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 
@@ -252,7 +252,7 @@ def test_two_processes_learn_what_one_learns(pairs, tmp_path):
     # without instance norm: what stands before it has biases whose gradient is rounding alone, and Adam magnifies it
     free = {"normalisation": "none"}
     path = write_recipe(tmp_path / "r.toml", tables(pairs, steps=5, network=free, discriminator=free))
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0", "--standalone",
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone",
                "-m", "rainstereo.apps.cli", "train", str(path), "--out", str(tmp_path / "two")]  # fmt: skip
     done = subprocess.run(command, env=ENVIRONMENT, check=False, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stderr[-2000:]
