@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ def build(seed: int, quick: bool) -> Stage:
     alignment = plan(rig)
     folder = Path(tempfile.mkdtemp(prefix="rainstereo-bench-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    source = _recording(folder / "raw", width, height, 16, seed)
+    source = _recording(folder / "raw", width, height, 8, seed)
     return Stage(
         "align",
         "a recording becomes aligned pairs, from files to files",
@@ -93,9 +93,13 @@ def _rate_work(folder: Path, source: FilePairs, alignment: Alignment, promised: 
     recipes: dict[str, Recipe] = {"align": align, "decode and encode": whole}
     if min(cropped) >= 0:
         recipes["decode and encode, cropped"] = replace(whole, window=cropped)
-    variants = [
-        Variant(name, partial(_job, folder / f"rate{i}", source, recipe), _no_error, ours=name == "align")
+    works = {
+        name: Work(source, recipe, Job(Outputs(folder / f"rate{i}"), "bench"))
         for i, (name, recipe) in enumerate(recipes.items())
+    }
+    pool = ProcessPoolExecutor(CORES, mp_context=get_context("spawn"), initializer=_prepare, initargs=(works,))
+    variants = [
+        Variant(name, partial(_job, pool, name, work), _no_error, name == "align") for name, work in works.items()
     ]
     peers = [v.name for v in variants[1:]]
     return Measured(
@@ -106,21 +110,26 @@ def _rate_work(folder: Path, source: FilePairs, alignment: Alignment, promised: 
     )  # fmt: skip
 
 
-@cache
-def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(CORES, mp_context=get_context("spawn"), initializer=cv2.setNumThreads, initargs=(1,))
+_here: dict[str, Work] = {}
 
 
-def _job(folder: Path, source: FilePairs, recipe: Recipe) -> int:
+def _prepare(works: dict[str, Work]) -> None:
+    """A worker learns its plans once, as in a job."""
+    cv2.setNumThreads(1)
+    _here.update(works)
+
+
+def _job(pool: ProcessPoolExecutor, name: str, work: Work) -> int:
     """All pairs, by both workers; how many."""
-    shutil.rmtree(folder, ignore_errors=True)
-    work = Work(source, recipe, Job.claim(Outputs(folder), "bench"))
-    halves: list[list[Chunk]] = [list(enumerate(chunks(len(source))))[i::CORES] for i in range(CORES)]
-    return sum(_pool().map(_some, [work] * CORES, halves))
+    shutil.rmtree(work.job.outputs.folder, ignore_errors=True)
+    Job.claim(work.job.outputs, "bench")
+    half = -(-len(work.source) // CORES)
+    halves = [(i, range(i * half, min((i + 1) * half, len(work.source)))) for i in range(CORES)]
+    return sum(pool.map(_some, [name] * CORES, halves))
 
 
-def _some(work: Work, mine: Sequence[Chunk]) -> int:
-    return sum(len(work.make(chunk).rows) for chunk in mine)
+def _some(name: str, chunk: Chunk) -> int:
+    return len(_here[name].make(chunk).rows)
 
 
 def _no_error(_: object) -> float:
