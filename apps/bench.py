@@ -26,6 +26,8 @@ STAGES: dict[str, str] = {
     "drops": "rainstereo.apps.bench_drops",
     "rain": "rainstereo.apps.bench_rain",
     "align": "rainstereo.apps.bench_align",
+    "select": "rainstereo.apps.bench_select",
+    "derain": "rainstereo.apps.bench_derain",
 }
 """Stage -> module with `build(seed, quick) -> Stage`."""
 
@@ -34,12 +36,13 @@ STAGES: dict[str, str] = {
 class Options:
     """Measure every way to do the same work: run time beside error, interleaved repeats, median and spread.
 
-    Stages: refraction, warp, calibration, drops, rain, align, or all. For each it writes OUT/STAGE/report.json (all
-    samples), report.html, a Markdown table and a plot of error against time; OUT/report.json sums up.
+    Stages: refraction, warp, calibration, drops, rain, align, select, derain, or all. For each it writes
+    OUT/STAGE/report.json (all samples), report.html, a Markdown table and a plot of error against time; OUT/report.json
+    sums up.
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What to measure: refraction, warp, calibration, drops, rain, align, or all."""
+    """What to measure: refraction, warp, calibration, drops, rain, align, select, derain, or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15

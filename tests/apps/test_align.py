@@ -149,6 +149,7 @@ def test_pixels_of_the_view_show_what_the_truth_says(recording: Path, tmp_path: 
         np.testing.assert_allclose(predicted, seen, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_lens_that_was_knocked_is_corrected_from_the_recording(recording: Path, tmp_path: Path) -> None:
     """The rig as calibrated, its wet camera turned since by 3 arc minutes."""
     truth = Rig.load(recording / "truth")
@@ -168,6 +169,7 @@ def test_a_lens_that_was_knocked_is_corrected_from_the_recording(recording: Path
     assert "arc minutes" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_auto_takes_the_disparity_away_that_infinity_leaves(recording: Path, tmp_path: Path) -> None:
     assert align(recording, tmp_path / "auto", "--plane", "auto", "--refine", "off", "--valid") == 0
     report = json.loads((tmp_path / "auto" / "report.json").read_text())
