@@ -50,6 +50,10 @@ COMMANDS: dict[str, Command] = {
     ),
     "rain": Command("adherent rain on any image", "rainstereo rain drive --out rainy --preset camvid --psnr 16.9"),
     "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
+    "record": Command(
+        "cameras and pump to a recording that survives a crash; verify, repair and export one",
+        "rainstereo record --dry aravis:DRY --wet aravis:WET --out drive",
+    ),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 
