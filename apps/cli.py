@@ -49,10 +49,19 @@ COMMANDS: dict[str, Command] = {
         "where simple drop models are good to a pixel, and where not", "rainstereo droplets --out out/droplets"
     ),
     "rain": Command("adherent rain on any image", "rainstereo rain drive --out rainy --preset camvid --psnr 16.9"),
+    "derain": Command("rain off images, videos and cameras", "rainstereo derain photo.png --out out/derained"),
+    "evaluate": Command(
+        "how much de-raining helps: the paper's tables on your data",
+        "rainstereo evaluate restoration camvid:frames --out out/evaluation",
+    ),
+    "export": Command("the de-rainer as ONNX, for other programs", "rainstereo export --out derain.onnx"),
     "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
     "record": Command(
         "cameras and pump to a recording that survives a crash; verify, repair and export one",
         "rainstereo record --dry aravis:DRY --wet aravis:WET --out drive",
+    ),
+    "pump": Command(
+        "drive the rig's pump: status, run, schedule, stop, monitor", "rainstereo pump run mist --simulate"
     ),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }

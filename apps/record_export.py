@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import datetime
 import io
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,8 @@ from rainstereo.rig import ROLES
 
 Layout = Literal["robotcar", "kitti"]
 CAMERAS = {"robotcar": {"dry": "dry", "wet": "wet"}, "kitti": {"dry": "image_02", "wet": "image_03"}}
+NO_CLOCK_US = 10**15
+"""Where pairs that know no time begin: sixteen digits, as RobotCar's names have, so that they sort."""
 HEADER = "name,dry,wet,timestamp_us,drive,regime,sync_us"
 
 
@@ -65,7 +68,7 @@ def export(
 def timestamp_us(pair: PairFrame) -> int:
     """The host's time of a pair, the camera's where there is none, else its number as if taken at 16 Hz."""
     at = pair.host_ts_ns if pair.host_ts_ns is not None else pair.device_ts_ns
-    return pair.id * 62_500 if at is None else at // 1000
+    return NO_CLOCK_US + pair.id * 62_500 if at is None else at // 1000
 
 
 def _write_times(out: Path, folders: dict[str, str], layout: Layout, stamps: list[int]) -> None:
@@ -79,7 +82,5 @@ def _write_times(out: Path, folders: dict[str, str], layout: Layout, stamps: lis
 
 
 def _date(stamp_us: int) -> str:
-    import datetime
-
     whole = datetime.datetime.fromtimestamp(stamp_us // 1_000_000, datetime.UTC)
     return f"{whole:%Y-%m-%d %H:%M:%S}.{stamp_us % 1_000_000:06d}000"

@@ -40,6 +40,7 @@ class Eigen(nn.Module):
     def __init__(self, config: EigenConfig) -> None:
         super().__init__()
         self.config = config
+        self.reach = (1, MARGIN, True)  # multiple, pixels to the farthest that counts, whether a tile equals the frame
         self.network = nn.Sequential(
             nn.Conv2d(RGB, config.units, FIRST),
             nn.Tanh(),

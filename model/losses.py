@@ -37,7 +37,8 @@ class LossWeights:
     """The lambdas of L_gen; the defaults are the paper's. A loss of weight 0 is not computed.
 
     adversarial: L_adv. perceptual: L_perc. msadv: L_msadv. pixel: mean absolute difference. squared: half of the mean
-    squared difference, as Eigen et al. 2013. rms: root of an image's mean squared difference. ssim: 1 - SSIM. adversary: "least_squares" or "cross_entropy" (Pix2Pix).
+    squared difference, as Eigen et al. 2013. rms: root of an image's mean squared difference. ssim: 1 - SSIM.
+    adversary: "least_squares" or "cross_entropy" (Pix2Pix).
     """
 
     lambda_adversarial: float = 1.0

@@ -11,9 +11,9 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from rainstereo.types import Array
 
 PROTOCOL = (
-    "PSNR and SSIM of scikit-image on whole images, nothing cropped, range 255 (65535 for 16 bits). RGB: PSNR of the "
-    "mean squared error over all channels; SSIM the mean over channels. Y: luma of BT.601 in 16..235, not rounded, same "
-    "range. "
+    "PSNR and SSIM of scikit-image on whole images, nothing cropped, range 255 (65535 for 16 bits, 1 for floats). RGB: "
+    "PSNR of the mean squared error over all channels; SSIM the mean over channels. Y: luma of BT.601 in 16..235 of "
+    "255, not rounded, same range. "
     "SSIM: uniform window of 7x7, sample covariance, K1 0.01, K2 0.03. Of a set: the mean over its images."
 )
 """Print it beside figures."""

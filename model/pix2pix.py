@@ -1,7 +1,7 @@
 """Baseline: Isola et al., "Image-to-Image Translation with Conditional Adversarial Networks" (Pix2Pix), CVPR 2017.
 
 The U-Net of its appendix, section 6.1: 8 convolutions of 4x4 and stride 2 down to 1x1 for 256x256 pixels, as many up,
-and the way down's features concatenated on the way up. Learned by L1 and a discriminator that sees the rainy image, too.
+and the way down's features concatenated on the way up. Learned by L1 and a discriminator that sees the rainy image too.
 Normalisation is over the image, which is what the paper's batch normalisation is for its batches of one, in training
 and in use. Dropout, the paper's noise, acts in training only, so that the same image gives the same result.
 """
@@ -58,6 +58,7 @@ class Pix2Pix(nn.Module):
     def __init__(self, config: Pix2PixConfig) -> None:
         super().__init__()
         self.config = config
+        self.reach = (config.multiple, config.multiple, False)  # multiple, margin, whether a tile equals the frame
         widths = [config.base_channels * min(1 << level, WIDEST) for level in range(config.downs)]
         coarsest = config.downs - 1
         self.downs = nn.ModuleList()

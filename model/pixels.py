@@ -1,0 +1,46 @@
+"""Images of OpenCV's as the networks' tensors, and back: uint8 or uint16, gray or BGR; float32 RGB in 0..1."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rainstereo.types import Image
+
+
+def check(image: Image) -> None:
+    """ValueError for what is no image that can be restored."""
+    if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
+        kind = getattr(image, "dtype", type(image).__name__)
+        raise ValueError(f"the image is {kind}; expected uint8 or uint16, as OpenCV reads files")
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or 0 in image.shape:
+        raise ValueError(
+            f"the image has shape {image.shape}; expected gray (H, W) or BGR (H, W, 3) of at least one pixel. Drop an "
+            "alpha channel with image[..., :3]"
+        )
+
+
+def to_rgb(image: Image, device: torch.device) -> Tensor:
+    """(1, 3, H, W) float32 in 0..1; gray is repeated."""
+    if image.dtype == np.uint16:  # torch on the processor computes little with unsigned 16 bits
+        tensor = torch.from_numpy(image.astype(np.int32)).to(device)
+    else:
+        own = np.ascontiguousarray(image)
+        tensor = torch.from_numpy(own if own.flags.writeable else own.copy()).to(device)
+    rgb = tensor.expand(3, *tensor.shape) if image.ndim == 2 else tensor.permute(2, 0, 1).flip(0)
+    return rgb.float().div_(float(np.iinfo(image.dtype).max)).unsqueeze(0)
+
+
+def from_rgb(rgb: Tensor, like: Image) -> Image:
+    """(3, H, W) in 0..1 as an image of the type and channels of another; gray is the mean of the channels."""
+    most = int(np.iinfo(like.dtype).max)
+    levels = (
+        rgb.float().mul(most).round_().clamp_(0, most) if like.ndim == 3 else rgb.float().mean(0).mul_(most).round_()
+    )
+    if like.ndim == 3:
+        levels = levels.flip(0).permute(1, 2, 0)
+    levels = levels.clamp_(0, most)
+    kind = torch.uint8 if like.dtype == np.uint8 else torch.int32
+    found: Image = np.ascontiguousarray(levels.to(kind).cpu().numpy()).astype(like.dtype, copy=False)
+    return found

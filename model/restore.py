@@ -1,0 +1,273 @@
+"""A rainy image in, a clear one out: the trained generator behind a drop detector, in tiles where it must be.
+
+    from rainstereo.model.restore import Restorer
+
+    restorer = Restorer()  # the weights in the package
+    clear = restorer(cv2.imread("photo.png"))
+
+An image without drops costs the detector and a copy, and comes back bit for bit; so does every cell of 16 pixels of
+any image in which the detector sees no drop. What is left is computed in rectangles with some of the image around them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from rainstereo.model import checkpoint as checkpoints
+from rainstereo.model.detector import CELL, CERTAIN, THRESHOLD, Detector, factor_for
+from rainstereo.model.networks import Network, OnnxNetwork, TorchNetwork, pick_device
+from rainstereo.model.pixels import check, from_rgb, to_rgb
+from rainstereo.model.tiles import Grid, Rect, Rows, covering, ramped, strips
+from rainstereo.types import Array, Image, Mask
+
+Backend = Literal["torch", "onnx"]
+Checkpoint = str | os.PathLike[str]
+
+MAX_PIXELS = 4 << 20
+"""What is computed at once, halo included; larger images are tiled."""
+SKIP_HALO = 32
+"""Pixels of the image around what holds drops that the generator sees, when the rest is skipped."""
+RAMP = 4
+"""Pixels within a marked cell over which the restored image replaces the given one."""
+OVERLAP = 32
+CALL = 8192
+"""Pixels that could be computed in the time that one more call takes."""
+WHOLE = 0.9
+"""Share of an image from which on it is computed whole."""
+
+
+@dataclass(frozen=True)
+class Restored:
+    """image: as given, restored. marked: share of cells that hold drops. computed: pixels that went through the
+    generator, over those of the image; more than 1 where tiles overlap."""
+
+    image: Image
+    marked: float
+    computed: float
+
+
+class Restorer:
+    """Restores images, uint8 or uint16, gray or BGR of any size, to the same type and shape; never changes its input.
+
+    checkpoint: NAME.safetensors with its card, or for the backend "onnx" a file that `rainstereo export` wrote; None:
+    the package's own. device: "auto", "cpu", "cuda", ... precision: "auto" (what pays there), "float32", "bf16",
+    "float16". backend: "torch" or "onnx".
+    tile: side, pixels, of the tiles of large images; None: by what may be computed at once, max_pixels.
+    skip: whether cells without drops are left as they are; threshold, certain: see `Detector`. halo: pixels that the
+    generator sees around what has drops. A detector of one's own may be given.
+    network: in place of a checkpoint, anything that is a `Network`.
+
+    ValueError where the checkpoint is not for such images.
+    """
+
+    def __init__(
+        self, checkpoint: Checkpoint | None = None, device: str | torch.device = "auto", precision: str = "auto",
+        tile: int | None = None, skip: bool = True, backend: Backend = "torch", *, threshold: float = THRESHOLD,
+        certain: float = CERTAIN, halo: int = SKIP_HALO, max_pixels: int = MAX_PIXELS,
+        detector: Detector | None = None, network: Network | None = None,
+    ) -> None:  # fmt: skip
+        if halo < 0 or (tile is not None and tile < 4 * CELL) or max_pixels < 1 << 16:
+            raise ValueError(
+                f"halo {halo}, tile {tile}, max_pixels {max_pixels} were given; expected a halo of 0 or more, a tile "
+                f"of at least {4 * CELL} and at least {1 << 16} pixels at once"
+            )
+        self.network = network or _network(checkpoint, device, precision, backend)
+        self.detector = (detector or Detector.shipped("cpu", threshold, certain)) if skip else None
+        step = self.network.multiple
+        self.step = step if step % CELL == 0 else int(np.lcm(step, CELL))
+        self.halo, self.max_pixels = -(-halo // self.step) * self.step, max_pixels
+        self._tile = tile
+
+    def __call__(self, image: Image) -> Image:
+        """The image, restored."""
+        return self.restored(image).image
+
+    def restored(self, image: Image) -> Restored:
+        """The image, restored, and how much of it had to be."""
+        check(image)
+        height, width = image.shape[:2]
+        if height * width <= self.max_pixels:
+            return self._at_once(image, factor_for(height, width))
+        out, top, told = np.empty_like(image), 0, _Counted()
+        for strip in self._strips(lambda first, last: image[first:last], (height, width), told):
+            out[top : top + len(strip)] = strip
+            top += len(strip)
+        return Restored(out, told.marked / told.calls, told.computed / (height * width))
+
+    def many(self, images: Sequence[Image]) -> list[Restored]:
+        """Images, restored; those of one size that are computed whole go through the generator as one batch."""
+        found: dict[int, Restored] = {}
+        whole: dict[tuple[int, ...], list[tuple[int, Mask]]] = {}
+        for i, image in enumerate(images):
+            check(image)
+            if _area(image) > self.max_pixels:
+                found[i] = self.restored(image)
+                continue
+            cells = self.marked(image)
+            if cells.any() and self.parts(cells, image) == [_whole(image)]:
+                whole.setdefault((*image.shape, image.dtype.itemsize), []).append((i, cells))
+            else:
+                found[i] = self.with_cells(image, cells)
+        for alike in whole.values():
+            batch = torch.cat([to_rgb(images[i], self.network.device) for i, _ in alike])
+            for (i, cells), rgb in zip(alike, self.network(batch), strict=True):
+                out = images[i].copy()
+                _pasted(out, from_rgb(rgb, out), _whole(out), cells)
+                found[i] = Restored(out, float(cells.mean()), 1.0)
+        return [found[i] for i in range(len(images))]
+
+    def rows(
+        self, read: Rows, size: tuple[int, int], told: Callable[[int, int], None] = lambda done, total: None
+    ) -> Iterator[Image]:
+        """An image of (height, width) that need not fit into memory, restored strip by strip from the top.
+
+        read: rows first .. last - 1 of it; each is asked for about once. told: tiles done, of how many.
+        """
+        return self._strips(read, size, told)
+
+    def grid(self, size: tuple[int, int]) -> Grid:
+        """The tiles of a large image."""
+        step, around = self.step, -(-self.network.halo // self.step) * self.step
+        side = self._tile or int(self.max_pixels**0.5) - 2 * around
+        side = max(4 * CELL, side // step * step)
+        overlap = min(OVERLAP, side // 2) // step * step
+        return Grid(size, side, around, overlap)
+
+    # -- what is computed ----------------------------------------------------------------------------------------------
+
+    def marked(self, image: Image, factor: int | None = None) -> Mask:
+        """Which cells of 16 pixels are restored: those with drops, or all where nothing is skipped."""
+        if self.detector is None:
+            return np.ones((-(-image.shape[0] // CELL), -(-image.shape[1] // CELL)), bool)
+        return self.detector.cells(image, factor)
+
+    def parts(self, cells: Mask, image: Image) -> list[Rect]:
+        """What the generator must see for these cells: rectangles of the image, or the whole of it."""
+        parts = covering(cells, CELL, self.halo, self.step, (image.shape[0], image.shape[1]), CALL)
+        return [_whole(image)] if sum(part.area for part in parts) >= WHOLE * _area(image) else parts
+
+    def with_cells(self, image: Image, cells: Mask, base: Image | None = None) -> Restored:
+        """The image with only these cells restored; the others are the given ones, or those of a base, bit for bit."""
+        out = (image if base is None else base).copy()
+        if not cells.any():
+            return Restored(out, 0.0, 0.0)
+        parts = self.parts(cells, image)
+        for part in parts:
+            restored = self.whole(image[part.slices])
+            top, left, bottom, right = (
+                part.top // CELL,
+                part.left // CELL,
+                -(-part.bottom // CELL),
+                -(-part.right // CELL),
+            )
+            _pasted(out, restored, part, cells[top:bottom, left:right])
+        return Restored(out, float(cells.mean()), sum(part.area for part in parts) / _area(image))
+
+    def whole(self, image: Image) -> Image:
+        """The image through the generator, as it is: no skipping, no tiles."""
+        return from_rgb(self.network(to_rgb(image, self.network.device))[0], image)
+
+    def _at_once(self, image: Image, factor: int) -> Restored:
+        if self.detector is None:
+            return Restored(self.whole(image), 1.0, 1.0)
+        return self.with_cells(image, self.marked(image, factor))
+
+    def _strips(self, read: Rows, size: tuple[int, int], told: Callable[[int, int], None]) -> Iterator[Image]:
+        factor = factor_for(*size)
+
+        def restore(part: Image) -> Image:
+            found = self._at_once(part, factor)
+            if isinstance(told, _Counted):
+                told.add(found, _area(part))
+            return found.image
+
+        return strips(read, self.grid(size), restore, told)
+
+
+class _Counted:
+    """Sums over the tiles of an image."""
+
+    def __init__(self) -> None:
+        self.calls, self.marked, self.computed = 0, 0.0, 0.0
+
+    def add(self, found: Restored, area: int) -> None:
+        self.calls += 1
+        self.marked += found.marked
+        self.computed += found.computed * area
+
+    def __call__(self, done: int, total: int) -> None:
+        """Progress, which nobody asked for."""
+
+
+def _area(image: Image) -> int:
+    return int(image.shape[0] * image.shape[1])
+
+
+def _whole(image: Image) -> Rect:
+    return Rect(0, 0, image.shape[0], image.shape[1])
+
+
+def _pasted(out: Image, restored: Image, part: Rect, cells: Mask) -> Image:
+    """Put the restored part into the image, in its marked cells only, with soft edges inside them."""
+    if cells.all():
+        out[part.slices] = restored
+        return out
+    weight: Array = ramped(cells, CELL, (part.bottom - part.top, part.right - part.left), RAMP)
+    if out.ndim == 3:
+        weight = weight[..., None]
+    given = out[part.slices]
+    mixed = given + weight * (restored.astype(np.float32) - given)
+    out[part.slices] = np.rint(mixed)
+    return out
+
+
+# -- checkpoints -------------------------------------------------------------------------------------------------------
+
+
+def _network(checkpoint: Checkpoint | None, device: str | torch.device, precision: str, backend: str) -> Network:
+    if backend == "onnx":
+        if checkpoint is None:
+            raise ValueError(
+                "the onnx backend needs a file: make one with rainstereo export --out derain.onnx, then give it as the "
+                "checkpoint"
+            )
+        return OnnxNetwork(Path(checkpoint))
+    if backend != "torch":
+        raise ValueError(f"backend {backend!r} is unknown; expected torch or onnx")
+    pick_device(device)  # says what is wrong with it before anything is read
+    return TorchNetwork(opened(checkpoint).build(), device, precision)
+
+
+def opened(checkpoint: Checkpoint | None) -> checkpoints.Checkpoint:
+    """A checkpoint that restores RGB images in 0..1; ValueError for another. None: the package's own."""
+    path = checkpoints.shipped() if checkpoint is None else Path(checkpoint)
+    if checkpoint is None and not path.is_file():
+        raise FileNotFoundError(
+            f"this package was built without its weights ({path.name}); give a checkpoint of rainstereo train"
+        )
+    if path.suffix == ".onnx":
+        raise ValueError(f"{path} is an ONNX file; choose the backend onnx for it")
+    found = checkpoints.load(path)
+    restores(found)
+    return found
+
+
+def restores(found: checkpoints.Checkpoint) -> None:
+    """ValueError where a checkpoint is no de-rainer of RGB images in 0..1."""
+    role = found.card.get("role", "generator")
+    if role != "generator":
+        raise ValueError(f"{found.path} holds a {role}; expected a generator, which is what restores images")
+    data = found.card.get("input", {})
+    channels, span = data.get("channels", 3), list(data.get("range", (0, 1)))
+    if channels != 3 or span != [0, 1]:
+        raise ValueError(
+            f"{found.path} is for images of {channels} channels with values in {span[0]} .. {span[-1]}; photographs "
+            "come as 3 channels in 0 .. 1. Take another checkpoint"
+        )
