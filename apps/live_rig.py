@@ -1,4 +1,4 @@
-"""`rainstereo simulate --live`: the digital rig at work. Fake cameras over UDP, the pump's own firmware, real recordings.
+"""`rainstereo simulate --live`: the digital rig at work, with cameras on the network and the pump's own firmware.
 
 OUT/live/boards    a recording of the board behind the chamber, pump off: for calibrate
 OUT/live/drive     a recording of the street while the pump follows its schedule: for align, select, train
@@ -82,7 +82,9 @@ def _record(
         }
         cameras = stack.enter_context(CameraPair(sources, grid_s=1 / rate_hz))
         pump = None if device is None else stack.enter_context(Pump.open(device.port))
-        options = record.Options(out=target, rate_hz=rate_hz, pairs=pairs, codec=codec, least_free_gb=0.2)
+        options = record.Options(
+            out=target, rate_hz=rate_hz, pairs=pairs, codec=codec, least_free_gb=0.2, watchdog_ms=2000
+        )
         about = {"cameras": {role: sources[role].name for role in ROLES}, "simulated": True}
         return record.take(options, target, cameras, pump, None if plan is None else plan.expand(), about)
 

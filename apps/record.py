@@ -23,7 +23,7 @@ from rainstereo.hardware.codec import CODECS
 from rainstereo.hardware.codec_choice import choose, disk_rate, measure
 from rainstereo.hardware.pair_frame import PairFrame
 from rainstereo.hardware.player import Player
-from rainstereo.hardware.pump import Pump
+from rainstereo.hardware.pump import WATCHDOG_MS, Pump
 from rainstereo.hardware.pump_log import SegmentLog
 from rainstereo.hardware.recording import Recording, open_recording
 from rainstereo.hardware.recording_repair import Verdict, repair, total_bytes, verify
@@ -65,6 +65,8 @@ class Options:
     """Serial port of the pump."""
     schedule: Path | None = None
     """The pump's schedule (TOML); see rainstereo pump."""
+    watchdog_ms: int = WATCHDOG_MS
+    """Silence of this program after which the pump turns itself off, 200 to 2000."""
     codec: str = "auto"
     """raw, zstd, blosc, jxl (JPEG XL), png, or auto: the smallest that keeps up on this machine, as measured."""
     workers: int = 2
@@ -110,7 +112,7 @@ def run(options: Options) -> int:
     return actions[options.action](options, options.recording)
 
 
-# -- take ----------------------------------------------------------------------------------------------------------------
+# -- take --------------------------------------------------------------------------------------------------------------
 
 
 def _take(options: Options) -> int:
@@ -146,7 +148,7 @@ def take(options: Options, out: Path, cameras: CameraPair, pump: Pump | None, pl
         if not any(camera.free_running for camera in cameras.cameras.values()):
             for pair in first:  # of files, nothing may be missing
                 writer.write(pair)
-        player = None if pump is None else Player(pump, plan, pump_log)
+        player = None if pump is None else Player(pump, plan, pump_log, options.watchdog_ms)
         left = None if options.pairs is None else max(0, options.pairs - writer.pairs - writer.waiting)
         until = StopWhen(left, options.seconds, round(1e9 * options.least_free_gb), options.silence_s)
         preview = Preview(out / "preview.jpg", options.preview_s)
@@ -237,7 +239,7 @@ def _text(path: Path | None) -> str | None:
     return None if path is None else path.read_text(encoding="utf-8")
 
 
-# -- look after ----------------------------------------------------------------------------------------------------------
+# -- look after --------------------------------------------------------------------------------------------------------
 
 
 def _progress() -> Progress:

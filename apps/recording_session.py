@@ -1,4 +1,4 @@
-"""Takes a recording: pairs from the cameras into the log, the pump by its schedule, and a line that says how it goes."""
+"""Takes a recording: pairs into the log, the pump by its schedule, and a line that says how it goes."""
 
 from __future__ import annotations
 
@@ -209,6 +209,6 @@ def results(outcome: Outcome, writer: RecordingWriter) -> dict[str, Any]:
     if health is not None:
         found["paired"] = health.pairs
         for role in ("dry", "wet"):
-            found[role] = dataclasses.asdict(getattr(health, role))
-        found["sync"] = {k: v for k, v in dataclasses.asdict(health.sync).items() if v == v}  # NaN is left out
+            found[role] = getattr(health, role)
+        found["sync"] = health.sync
     return found

@@ -76,7 +76,9 @@ def run(options: Options) -> int:
         words = f", {done.latest['psnr']:.2f} dB from {done.latest['psnr_raw']:.2f}" if done.latest else ""
         watcher.console.print(f"{done.trainer.done} steps{words}: {out / 'model.safetensors'}", soft_wrap=True)
         if not learnt:
-            watcher.console.print(f"4 windows were not learnt to {ENOUGH:g} dB; see {out / 'report.html'}", soft_wrap=True)
+            watcher.console.print(
+                f"4 windows were not learnt to {ENOUGH:g} dB; see {out / 'report.html'}", soft_wrap=True
+            )
     return DONE if learnt else FAILED
 
 
@@ -216,7 +218,9 @@ class Watcher:
         report = Report("Training", f"{run.out.name}: {recipe.architecture}, {len(run.items)} images")
         psnr, raw = run.latest.get("psnr", float("nan")), run.latest.get("psnr_raw", float("nan"))
         if record.status != "ok":
-            report.verdict("bad", f"{WINDOWS} windows were not learnt to {ENOUGH:g} dB: {psnr:.2f} dB.", "Does not learn.")
+            report.verdict(
+                "bad", f"{WINDOWS} windows were not learnt to {ENOUGH:g} dB: {psnr:.2f} dB.", "Does not learn."
+            )
         elif run.latest:
             gain = psnr - raw
             words = f"{psnr:.2f} dB on held-out images, {gain:+.2f} dB against the rainy ones."

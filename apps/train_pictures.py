@@ -69,7 +69,10 @@ def samples(triples: list[tuple[Tensor, Tensor, Tensor]]) -> Image:
     """BGR picture, one row an image: rainy, derained, clear. Each (3, H, W) RGB, 0 to 1."""
     rows = []
     for triple in triples[:ROWS]:
-        images = [np.ascontiguousarray((t.clamp(0, 1) * 255).round().byte().numpy().transpose(1, 2, 0)[..., ::-1]) for t in triple]
+        images = [
+            np.ascontiguousarray((t.clamp(0, 1) * 255).round().byte().numpy().transpose(1, 2, 0)[..., ::-1])
+            for t in triple
+        ]
         height, width = images[0].shape[:2]
         if height > TALLEST:
             size = max(1, round(width * TALLEST / height)), TALLEST
