@@ -27,6 +27,7 @@ STAGES: dict[str, str] = {
     "rain": "rainstereo.apps.bench_rain",
     "select": "rainstereo.apps.bench_select",
     "derain": "rainstereo.apps.bench_derain",
+    "record": "rainstereo.apps.bench_record",
 }
 """Stage -> module with `build(seed, quick) -> Stage`."""
 
@@ -35,12 +36,13 @@ STAGES: dict[str, str] = {
 class Options:
     """Measure every way to do the same work: run time beside error, interleaved repeats, median and spread.
 
-    Stages: refraction, warp, calibration, drops, rain, select, derain, or all. For each it writes OUT/STAGE/report.json (all
-    samples), report.html, a Markdown table and a plot of error against time; OUT/report.json sums up.
+    Stages: refraction, warp, calibration, drops, rain, select, derain, record, or all. For each it writes
+    OUT/STAGE/report.json (all samples), report.html, a Markdown table and a plot of error against time; OUT/report.json
+    sums up.
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What to measure: refraction, warp, calibration, drops, rain, select, derain, or all."""
+    """What to measure: refraction, warp, calibration, drops, rain, select, derain, record, or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15
