@@ -26,6 +26,7 @@ STAGES: dict[str, str] = {
     "drops": "rainstereo.apps.bench_drops",
     "rain": "rainstereo.apps.bench_rain",
     "align": "rainstereo.apps.bench_align",
+    "record": "rainstereo.apps.bench_record",
     "select": "rainstereo.apps.bench_select",
     "train": "rainstereo.apps.bench_train",
     "derain": "rainstereo.apps.bench_derain",
@@ -42,7 +43,7 @@ class Options:
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What to measure: refraction, warp, calibration, drops, rain, align, select, train, derain, or all."""
+    """What to measure: refraction, warp, calibration, drops, rain, align, record, select, train, derain, or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15
