@@ -80,8 +80,11 @@ def run(options: Options) -> int:
     write_atomically(options.out.with_suffix(".toml"), to_toml(card).encode())
     record["held_out"], record["bytes"] = found, len(data)
     record.write(options.out.with_name(f"{options.out.stem}.report.json"))
-    console.print(f"{options.out}: {len(data)} bytes; of held-out cells with a drop {100 * made.found:.0f} % are found, "
-                  f"of those without one {100 * made.false:.1f} % marked")  # fmt: skip
+    console.print(
+        f"{options.out}: {len(data)} bytes; of held-out cells with a drop {100 * made.found:.0f} % are found, of those "
+        f"without one {100 * made.false:.1f} % marked",
+        soft_wrap=True,
+    )
     return DONE
 
 

@@ -32,7 +32,10 @@ class Network(Protocol):
 
 
 class TorchNetwork:
-    """By torch, which takes the module over: it is moved and converted. precision: "float32", "bf16", "float16" or "auto", which takes what pays on the device."""
+    """By torch, which takes the module over: it is moved and converted.
+
+    precision: "float32", "bf16", "float16" or "auto", which takes what pays on the device.
+    """
 
     def __init__(self, module: nn.Module, device: str | torch.device = "auto", precision: str = "auto") -> None:
         self.device = pick_device(device)
