@@ -60,6 +60,9 @@ COMMANDS: dict[str, Command] = {
         "rainstereo detector frames --out detector.safetensors",
     ),
     "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
+    "pump": Command(
+        "drive the rig's pump: status, run, schedule, stop, monitor", "rainstereo pump run mist --simulate"
+    ),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 
