@@ -69,14 +69,14 @@ def test_weights_survive_a_file_and_damage_is_refused(tmp_path: Path) -> None:
 
 def test_a_few_steps_of_training_learn_something(tmp_path: Path) -> None:
     images = [cv2.resize(picture(i, (24, 32)), (128, 96)) for i in range(3)]
-    recipe = detector_training.Recipe(steps=60, batch=6, pool=8, size=(48, 64), rate=5e-3)
+    recipe = detector_training.Recipe(steps=40, batch=4, pool=4, size=(48, 64), rate=1e-2)
     rain = RandomAdherentRain("large", (0.2, 0.4), rays=2, p=1.0)
     seen: list[str] = []
     made = detector_training.train(
         images, [rain], recipe, DetectorConfig(8, (1, 2)), lambda what, done, total: seen.append(what)
     )
     assert 0 < made.loss < 0.69  # below that of a coin
-    assert seen == ["rendering"] * 8 + ["training"] * 60
+    assert seen == ["rendering"] * 4 + ["training"] * 40
     with pytest.raises(ValueError, match="expected at least 64 x 48"):
         detector_training.train([picture(0, (20, 20))], [rain], recipe)
     with pytest.raises(ValueError, match="at least one of each"):
