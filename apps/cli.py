@@ -55,6 +55,10 @@ COMMANDS: dict[str, Command] = {
         "rainstereo evaluate restoration camvid:frames --out out/evaluation",
     ),
     "export": Command("the de-rainer as ONNX, for other programs", "rainstereo export --out derain.onnx"),
+    "detector": Command(
+        "the network that says where drops are, for derain to skip the rest",
+        "rainstereo detector frames --out detector.safetensors",
+    ),
     "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
     "record": Command(
         "cameras and pump to a recording that survives a crash; verify, repair and export one",
