@@ -38,8 +38,8 @@ STAGES: dict[str, str] = {
 class Options:
     """Measure every way to do the same work: run time beside error, interleaved repeats, median and spread.
 
-    For each stage it writes OUT/STAGE/report.json (all
-    samples), report.html, a Markdown table and a plot of error against time; OUT/report.json sums up.
+    For each stage it writes OUT/STAGE/report.json (all samples), report.html, a Markdown table and a plot of error
+    against time; OUT/report.json sums up.
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
