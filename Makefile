@@ -21,7 +21,6 @@ test-py312:
 firmware-test: env
 	@.ci/firmware
 	$(RUN) pytest tests/hardware tests/apps/test_pump.py
-	$(MAKE) -C firmware fuzz
 
 # Cameras over GigE Vision: Aravis's fake ones, in a network of their own; installs Debian's packages for that.
 rig-test: env

@@ -55,6 +55,10 @@ COMMANDS: dict[str, Command] = {
         "rainstereo evaluate restoration camvid:frames --out out/evaluation",
     ),
     "export": Command("the de-rainer as ONNX, for other programs", "rainstereo export --out derain.onnx"),
+    "detector": Command(
+        "the network that says where drops are, for derain to skip the rest",
+        "rainstereo detector frames --out detector.safetensors",
+    ),
     "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
     "record": Command(
         "cameras and pump to a recording that survives a crash; verify, repair and export one",
@@ -65,6 +69,9 @@ COMMANDS: dict[str, Command] = {
     ),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
+
+ACTIONS: dict[str, tuple[str, ...]] = {"evaluate": ("segmentation",)}
+"""Second words that have options of their own: `evaluate segmentation` is the module evaluate_segmentation."""
 
 _REMEDIES = {
     "mrcal": "sudo apt-get install python3-mrcal (Debian, Ubuntu); from Python 3.12 on: pip install --no-deps mrcal",
@@ -137,11 +144,13 @@ Exit status: 0 done, 1 the work failed, 2 bad usage or input. --debug shows wher
 
 
 def _run(name: str, arguments: Sequence[str]) -> int:
-    module = importlib.import_module(f"rainstereo.apps.{name}")
+    words = [name, *arguments[:1]] if arguments and arguments[0] in ACTIONS.get(name, ()) else [name]
+    module = importlib.import_module(f"rainstereo.apps.{'_'.join(words)}")
+    arguments = arguments[len(words) - 1 :]
     import tyro
 
     style = (tyro.conf.FlagCreatePairsOff,)  # a switch that is off has --quick, and no --no-quick beside it
-    options = tyro.cli(module.Options, prog=f"rainstereo {name}", args=list(arguments), config=style)
+    options = tyro.cli(module.Options, prog=f"rainstereo {' '.join(words)}", args=list(arguments), config=style)
     return int(module.run(options))
 
 

@@ -28,7 +28,7 @@ class Options:
     """
 
     what: Annotated[tyro.conf.Positional[Literal["restoration"]], tyro.conf.arg(metavar="restoration")]
-    """What to evaluate."""
+    """What to evaluate. Segmentation has options of its own: see rainstereo evaluate segmentation --help."""
     sets: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SET")]
     """FOLDER, or LAYOUT:FOLDER with qian, robotcar, pairs or camvid."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/evaluation")

@@ -1,4 +1,5 @@
-"""`rainstereo train`: a de-raining network from a recipe, on this machine's processor or GPUs; it goes on after any end."""
+"""`rainstereo train`: a de-raining network from a recipe, on this machine's processor or GPUs; it goes on after any
+end."""
 
 from __future__ import annotations
 
@@ -39,9 +40,9 @@ WINDOWS, ENOUGH = 4, 35.0
 class Options:
     """Train a de-raining network as a recipe says. What the recipe leaves out is as in the paper.
 
-    A run that was interrupted, even by kill -9, goes on from its latest checkpoint when it is repeated, and finds the same
-    losses as if nothing had happened. On several GPUs: torchrun --nproc-per-node 4 -m rainstereo.apps.cli train RECIPE.
-    See docs/training.md.
+    A run that was interrupted, even by kill -9, goes on from its latest checkpoint when it is repeated, and finds the
+    same losses as if nothing had happened. On several GPUs: torchrun --nproc-per-node 4 -m rainstereo.apps.cli train
+    RECIPE. See docs/training.md.
     """
 
     recipe: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECIPE.toml")]
@@ -119,7 +120,8 @@ class Watcher:
         self._sheet_at = -1
         self._sheet: Image | None = None
         columns = (
-            TextColumn("train"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[words]}"), TimeElapsedColumn(),
+            TextColumn("train"), BarColumn(),
+            MofNCompleteColumn(), TextColumn("{task.fields[words]}"), TimeElapsedColumn(),
         )  # fmt: skip
         self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
         self._task: TaskID | None = None
