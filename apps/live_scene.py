@@ -132,7 +132,7 @@ def draw_for_ever(rig: Rig, images: Path, board: FrameBoard, rate_hz: float, tra
                 view.plan(regime, level)
     water, following = Water(), Trace(trace)
     over = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
+    threading.Thread(target=_wait_for_end, args=(over,), daemon=True).start()
     begun = done = moment_at(time.time(), rate_hz)
     order = [*range(len(pairs)), *range(len(pairs) - 2, 0, -1)] if trace is not None else list(range(len(pairs)))
     while not over.is_set():
@@ -147,6 +147,11 @@ def draw_for_ever(rig: Rig, images: Path, board: FrameBoard, rate_hz: float, tra
         water.follow(following.news(), time.monotonic())
         i = order[done % len(order)]
         board.draw(done, shown[i], _wet(view, water, colour[i], clear[i]))
+
+
+def _wait_for_end(over: threading.Event) -> None:
+    sys.stdin.read()
+    over.set()
 
 
 def _wet(view: WetView | None, water: Water, colour: Image, clear: Image) -> Image:

@@ -96,7 +96,7 @@ class AravisCamera:
             self._camera.get_device().connect("control-lost", self._on_lost)
         except aravis_error() as error:
             self._camera = None
-            raise CameraGoneError(f"{self.name}: {error.message}") from error
+            raise CameraGoneError(f"{self.name}: {error}") from error
 
     def _on_lost(self, *_: object) -> None:
         self._lost = True
@@ -118,7 +118,7 @@ class AravisCamera:
             self._overruns = 0
             self._silent_since = None
         except aravis_error() as error:
-            raise CameraGoneError(f"{self.name}: {error.message}") from error
+            raise CameraGoneError(f"{self.name}: {error}") from error
 
     def read(self, timeout_s: float) -> CameraFrame | None:
         """The next whole frame."""

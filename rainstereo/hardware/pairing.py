@@ -158,11 +158,14 @@ class Pairer:
                 step += stream.wrap * round((expected - step) / stream.wrap)
             elif step > stream.wrap - MOST_WAITING:
                 step -= stream.wrap
+        due = step if self._grid is None or expected is None else round(expected)
+        if self._grid is not None and due >= step:
+            expected = None  # the grid tells exactly how many triggers went uncounted
         if expected is not None and abs(step - expected) > max(8.0, 0.5 * abs(expected)):
             self.broken = f"a counter went on by {step} while its clock went on by {expected:.1f} periods"
             self._end()
             return None
-        number = stream.newest + step
+        number = stream.newest + due
         if step <= 0:
             if number not in stream.missing:
                 return None
@@ -170,10 +173,12 @@ class Pairer:
             stream.counters.lost -= 1
             return number
         stream.counters.lost += step - 1
-        stream.missing.update(range(max(stream.newest + 1, number - MOST_WAITING), number))
+        stream.counters.missed += due - step
+        if due == step:
+            stream.missing.update(range(max(stream.newest + 1, number - MOST_WAITING), number))
         due_ns = self._due_ns(frame)
         if due_ns is not None and stream.newest_ns is not None:
-            self._intervals.append((due_ns - stream.newest_ns) / step)
+            self._intervals.append((due_ns - stream.newest_ns) / due)
         stream.raw, stream.newest, stream.newest_ns = frame.id, number, due_ns
         stream.missing = {n for n in stream.missing if n > number - MOST_WAITING}
         return number

@@ -159,6 +159,18 @@ def test_late_timestamps_of_triggers_on_a_grid() -> None:
     """As fakes on a busy machine: every timestamp late by up to 0.9 periods, moments skipped, counters anywhere."""
     p = pairer(shared_clock=True, grid_ns=PERIOD)
     rng = np.random.default_rng(5)
+    stutter = {role: set(np.flatnonzero(rng.random(3000) < 0.6).tolist()) for role in ROLES}
+    frames = []
+    for role in ROLES:
+        kept = [t for t in range(3000) if t not in stutter[role]]
+        for i, t in enumerate(kept):
+            pixels = np.frombuffer(t.to_bytes(8, "little"), np.uint8).reshape(2, 4)
+            at = t * PERIOD + round(float(rng.uniform(0, 0.9)) * PERIOD)
+            frames.append((at, role, CameraFrame(pixels, (65400 + i) % 65535 + 1, at, None, "Mono8")))
+    stuttering = [q for _, role, frame in sorted(frames, key=lambda f: f[0]) for q in p.offer(role, frame)]
+    assert not mismatched(stuttering)
+    assert len(stuttering) >= len(set(range(3000)) - stutter["dry"] - stutter["wet"]) - 5  # every moment that both saw
+    p = pairer(shared_clock=True, grid_ns=PERIOD)
     pairs = []
     for role, skipped in (("dry", {7, 30, 31}), ("wet", {8, 50})):
         count = 65400
