@@ -18,7 +18,7 @@ from rainstereo.apps.bench_harness import Stage, Target, Variant, Work
 from rainstereo.apps.photographs import photograph
 from rainstereo.apps.rain_presets import preset
 from rainstereo.apps.rain_settings import Rain, psnr
-from rainstereo.model import checkpoint, export
+from rainstereo.model import checkpoint, detector, export
 from rainstereo.model.detector import Detector
 from rainstereo.model.frame_sequence import FrameSequence
 from rainstereo.model.generator import Generator, GeneratorConfig
@@ -222,7 +222,7 @@ def _curve_work(shipped: Network, frames: Frames) -> Work:
     """Quality against time over halo and threshold, on scattered drops."""
     image, whole = frames.scattered, Restorer(network=shipped, skip=False)
     reference = psnr(frames.clear, whole(image))
-    weights = Detector.shipped().network
+    weights = detector.load(detector.shipped())
 
     def lost(found: Image) -> float:
         return reference - psnr(frames.clear, found)
@@ -231,7 +231,7 @@ def _curve_work(shipped: Network, frames: Frames) -> Work:
     for halo in (0, 16, 32, 64):
         made = Restorer(network=shipped, halo=halo)
         variants.append(Variant(f"halo {halo}", partial(made, image), lost, True))
-    for low, high in ((0.05, 0.3), (0.15, 0.7), (0.3, 0.7), (0.5, 0.9)):
+    for low, high in ((0.05, 0.3), (0.15, 0.7), (0.2, 0.8), (0.5, 0.9)):
         made = Restorer(network=shipped, detector=Detector(weights, "cpu", low, high))
         variants.append(Variant(f"thresholds {low:g}, {high:g}", partial(made, image), lost, True))
     return Work(

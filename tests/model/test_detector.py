@@ -27,6 +27,17 @@ def test_a_probability_for_each_cell(size: tuple[int, int]) -> None:
         assert ((cells > 0) & (cells < 1)).all()
 
 
+def test_what_was_fused_is_the_network() -> None:
+    torch.manual_seed(3)
+    network = DetectorConfig(6, (1, 2)).build().train()
+    network(torch.rand(4, 3, 32, 32))  # statistics that matter
+    image = picture(0, (64, 96))
+    rgb = torch.from_numpy(image[..., ::-1].transpose(2, 0, 1).copy())[None] / 255
+    with torch.inference_mode():
+        truth = torch.nn.functional.max_pool2d(network.eval()(rgb).sigmoid(), 4)[0, 0].numpy()
+    assert np.abs(Detector(network).probability(image) - truth).max() < 1e-5
+
+
 def test_how_far_an_image_is_averaged() -> None:
     assert [factor_for(h, w) for h, w in ((1, 1), (240, 320), (360, 480), (480, 640), (960, 1280), (9000, 9000))] == [
         1, 1, 2, 2, 4, 4,
