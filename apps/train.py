@@ -225,7 +225,8 @@ class Watcher:
             )
         elif run.latest:
             gain = psnr - raw
-            words = f"{psnr:.2f} dB on held-out images, {gain:+.2f} dB against the rainy ones."
+            where = "the windows it was trained on" if recipe.data.only else "held-out images"
+            words = f"{psnr:.2f} dB on {where}, {gain:+.2f} dB against the rainy ones."
             report.verdict("good" if gain > 0 else "warn", words)
         tiles = [
             Tile("steps", run.trainer.done),

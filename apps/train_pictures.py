@@ -35,7 +35,7 @@ def read_table(path: Path) -> dict[str, Array]:
 
 @styled
 def curves(losses: dict[str, Array], validation: dict[str, Array]) -> Figure:
-    """Losses, smoothed over a fiftieth of the run, and the PSNR of held-out images, over steps."""
+    """Losses, smoothed over a fiftieth of the run, and the PSNR of validations, over steps."""
     figure, (left, right) = sheet(9.0, 3.2, 1, 2)
     names = [name for name in losses if name not in ("step", "elapsed_s", "rate", "total")]
     for i, name in enumerate(names):
@@ -51,7 +51,7 @@ def curves(losses: dict[str, Array], validation: dict[str, Array]) -> Figure:
         right.plot(validation["step"], validation["psnr"], marker=".", label="derained")
         right.plot(validation["step"], validation["psnr_raw"], ls="--", lw=1, label="rainy")
         right.legend()
-    right.set(xlabel="step", ylabel="dB", title="PSNR of held-out images (RGB)")
+    right.set(xlabel="step", ylabel="dB", title="PSNR of validations (RGB)")
     return figure
 
 
