@@ -118,6 +118,6 @@ def _refuse_overlap(options: Options, source: PairSource) -> None:
     inside = next((path for path in sorted(given) for folder in folders if folder in (path, *path.parents)), None)
     if inside is not None or options.out.resolve() in given:
         raise ValueError(
-            f"--out {options.out} would write among the recording's own files, in {inside or options.out}; give a folder "
-            "elsewhere"
+            f"--out {options.out} would write among the recording's own files, in {inside or options.out}; give a "
+            "folder elsewhere"
         )

@@ -1,4 +1,4 @@
-"""How one recording is aligned: estimated once from a few of its pairs, kept as plain numbers, the same for all shards."""
+"""How a recording is aligned: estimated once from a few of its pairs, kept as numbers, the same for all shards."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def eight_bits(image: Image) -> Image:
     return image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
 
 
-# -- with a calibration --------------------------------------------------------------------------------------------------
+# -- with a calibration ----------------------------------------------------------------------------------------
 
 
 def _from_rig(options: Options, rig: Rig, sample: Sequence[ImagePair]) -> dict[str, Any]:
@@ -137,6 +137,10 @@ def _from_rig(options: Options, rig: Rig, sample: Sequence[ImagePair]) -> dict[s
                 votes, rig = without_turn(votes, far.view, found.rotation), turned(rig, found.rotation)
         if asked is None:
             fit = fit_plane(votes, rig, far.view)
+            if fit.plane is not INFINITY:
+                there = plan(rig, fit.plane)
+                again = TileVotes.measure((eight_bits(a), eight_bits(b)) for a, b in (there.apply(*p) for p in sample))
+                fit = fit_plane(again, rig, there.view, fit.plane)
             plane = fit.plane
             fitted = {"words": fit.words, "tiles": fit.tiles, "mean_px": {"at_infinity": fit.before[0],
                       "at_plane": fit.after[0]}, "median_px": {"at_infinity": fit.before[1],
@@ -163,7 +167,7 @@ def _occlusion_of_rig(options: Options, rig: Rig, alignment: Alignment) -> Occlu
     return Occlusion(1 if centre[0] < 0 else -1, max(low, -64), min(reach / NEAREST, 200), options.valid_px)
 
 
-# -- without -------------------------------------------------------------------------------------------------------------
+# -- without ---------------------------------------------------------------------------------------------------
 
 
 def _from_images(options: Options, sample: Sequence[ImagePair]) -> dict[str, Any]:

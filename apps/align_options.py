@@ -89,7 +89,7 @@ def plane_of(options: Options) -> Plane | None:
     plane = None if options.plane == "auto" else Plane.parse(options.plane)
     if options.rig is None and plane is not None and plane != INFINITY:
         raise ValueError(
-            f"--plane {options.plane} needs --rig: without a calibration, depths mean nothing. Expected infinity (align "
-            "the far scene) or auto (align what most of the images shows)"
+            f"--plane {options.plane} needs --rig: without a calibration, depths mean nothing. Expected infinity "
+            "(align the far scene) or auto (align what most of the images shows)"
         )
     return plane

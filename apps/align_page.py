@@ -59,9 +59,7 @@ def _verdict(report: Report, plan: Plan, pairs: int, skipped: list[Skip], median
     if not pairs:
         report.verdict("bad", "No pair could be aligned; the table of skipped files says why.")
     elif not np.isfinite(median).all():
-        report.verdict(
-            "warn", "The pairs are written, but share too little texture to measure what shift remains." + also
-        )
+        report.verdict("warn", "The pairs are written, but share too little texture to tell what shift remains." + also)
     elif abs(median[1]) > 1:
         what = (
             "is this the rig that made the recording, and has nothing moved since?"
@@ -107,8 +105,8 @@ def _how(report: Report, model: dict[str, Any]) -> None:
             f"No calibration: {pair['words']}.",
             f"{agreeing:,} of {pair['matches'][0]:,} matched features agree, in {model['pairs_used']} pairs; "
             f"sigma ({pair['sigma'][0]:.2f}, {pair['sigma'][1]:.2f}) px.",
-            f"Their parallax runs from {spread[0]:+.1f} to {spread[1]:+.1f} px (10th to 90th percentile): no single warp "
-            "takes that away.",
+            f"Their parallax runs from {spread[0]:+.1f} to {spread[1]:+.1f} px (10th to 90th percentile): no single "
+            "warp takes that away.",
         ])  # fmt: skip
     else:
         lines = [f"Plane: {model['plane']['words']}."]
@@ -121,8 +119,8 @@ def _how(report: Report, model: dict[str, Any]) -> None:
             axes = zip(("pitch", "yaw", "roll"), turn, sigma, strict=True)
             words = ", ".join(f"{name} {t:+.2f} +- {s:.2f}" for name, t, s in axes)
             across = refinement["across_px"]
-            lines.append(f"Correction, arc minutes: {words}; shifts across the baseline fell from {across['before']:.2f} "
-                         f"to {across['after']:.2f} px RMS.")  # fmt: skip
+            lines.append(f"Correction, arc minutes: {words}; shifts across the baseline fell from "
+                         f"{across['before']:.2f} to {across['after']:.2f} px RMS.")  # fmt: skip
         report.bullets(lines)
     if model.get("photometric"):
         words = model["photometric"]["words"]
@@ -135,9 +133,7 @@ def _remaining(report: Report, plan: Plan, samples: list[Sample]) -> None:
     good = first.trustworthy
     if good.any():
         field = residual_field(first.centres[good], first.shifts[good], size, title=f"pair {first.name}", what="tiles")
-        report.figure(
-            field, "Wet minus dry. Along the baseline: parallax of near things. Across it: an error of the rig."
-        )
+        report.figure(field, "Wet minus dry. Along the baseline: parallax. Across it: an error of the rig.")
     _, most = residual_map(votes_of(samples), size)
     if np.isfinite(most).sum() > 4:
         report.figure(heat_map(_filled(most), size, "px", title="remaining shift, 90th percentile, by place"),
@@ -195,8 +191,8 @@ def _homography(report: Report, plan: Plan) -> None:
     words = (
         f"Over {share:.0%} of the plane's image they differ by more than {NOTICEABLE:g} px, by {most:.2f} px at most."
         if share > 0
-        else f"Nowhere do they differ by more than {NOTICEABLE:g} px (at most {most:.3f} px): both cameras look through the "
-        "same panels, whose shifts nearly cancel."
+        else f"Nowhere do they differ by more than {NOTICEABLE:g} px (at most {most:.3f}): both cameras look through "
+        "the same panels, whose shifts nearly cancel."
     )
     report.text(words + " This warp uses the exact one either way; it costs nothing more.")
     if share > 0:

@@ -120,7 +120,7 @@ def _tiff(path: Path) -> tuple[tuple[int, int], BigImage | None] | None:
 
     try:
         with tifffile.TiffFile(path) as file:
-            page = file.pages[0]
+            page: Any = file.pages[0]
             size = int(page.imagelength), int(page.imagewidth)
             channels = int(page.samplesperpixel)
             plain = (channels, page.photometric.name) in ((1, "MINISBLACK"), (3, "RGB")) and page.planarconfig == 1
@@ -180,12 +180,14 @@ def _write_tiff(path: Path, strips: Iterable[Image], like: BigImage) -> None:
     colour = len(like.shape) == 3
     kind = like.kind.newbyteorder("=")
     size = int(np.prod(like.shape, dtype=np.int64)) * kind.itemsize
-    start, _ = tifffile.imwrite(
+    placed = tifffile.imwrite(
         path, None, shape=like.shape, dtype=kind, photometric="rgb" if colour else "minisblack",
         bigtiff=size > 3 << 30, metadata=None, returnoffset=True,
     )  # fmt: skip
+    if placed is None:
+        raise RuntimeError("tifffile did not say where the pixels go")
     with path.open("r+b") as file:
-        file.seek(start)
+        file.seek(placed[0])
         for strip in strips:
             file.write(np.ascontiguousarray(strip[..., ::-1] if colour else strip).data)
 

@@ -55,7 +55,14 @@ COMMANDS: dict[str, Command] = {
         "rainstereo evaluate restoration camvid:frames --out out/evaluation",
     ),
     "export": Command("the de-rainer as ONNX, for other programs", "rainstereo export --out derain.onnx"),
+    "detector": Command(
+        "the network that says where drops are, for derain to skip the rest",
+        "rainstereo detector frames --out detector.safetensors",
+    ),
     "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
+    "pump": Command(
+        "drive the rig's pump: status, run, schedule, stop, monitor", "rainstereo pump run mist --simulate"
+    ),
     "bench": Command("time and error of each way to do the same work", "rainstereo bench refraction --out out/bench"),
 }
 

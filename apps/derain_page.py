@@ -60,7 +60,7 @@ def derain_page(folder: Path, record: Record, notes: Sequence[Note], network: st
 
 def _words(note: Note) -> str:
     share = note.get("computed")
-    return note["name"] + ("" if share is None else f": {100 * share:.0f} % of the frame computed")
+    return f"{note['name']}" + ("" if share is None else f": {100 * share:.0f} % of the frame computed")
 
 
 def _pair(folder: Path, note: Note) -> tuple[Image, Image] | None:

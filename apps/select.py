@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from rainstereo.apps.cli import DONE, FAILED
-from rainstereo.apps.record import Record
+from rainstereo.apps.run_record import Record
 from rainstereo.apps.select_card import card, rig_files, write_card
 from rainstereo.apps.select_manifest import COLUMNS, Layout, rows_of, write_csv, write_parquet, write_rejected
 from rainstereo.apps.select_measuring import measured

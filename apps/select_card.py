@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rainstereo.apps.record import jsonable, versions, write_atomically, write_json
+from rainstereo.apps.run_record import jsonable, versions, write_atomically, write_json
 from rainstereo.apps.select_manifest import Row
 from rainstereo.selection.choose import Selection, Settings
 from rainstereo.selection.rejection import REASONS

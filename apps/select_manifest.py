@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rainstereo.apps.record import write_atomically
+from rainstereo.apps.run_record import write_atomically
 from rainstereo.selection.candidate import Candidate, Measures
 from rainstereo.selection.choose import Selection
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import cv2
 
-from rainstereo.apps.record import write_atomically
+from rainstereo.apps.run_record import write_atomically
 from rainstereo.selection.candidate import Candidate, Measures
 from rainstereo.selection.measure import VERSION, measure_run
 

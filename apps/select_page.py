@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from rainstereo import imagefile
-from rainstereo.apps.record import Record
 from rainstereo.apps.report import Report, Tile, quantity
+from rainstereo.apps.run_record import Record
 from rainstereo.apps.select_card import SPLIT_ORDER
 from rainstereo.apps.select_manifest import Row
 from rainstereo.selection.candidate import Candidate

@@ -106,6 +106,8 @@ class Windows(Dataset[Sample]):
 
     def __getitem__(self, number: int) -> Sample:
         """Window `number`; ValueError with the file's name where an image cannot be read."""
+        if self.data.only:
+            number %= self.data.only
         epoch, position = divmod(number, len(self.items))
         item = self.items[int(order(self.seed, epoch, len(self.items))[position])]
         rng = np.random.default_rng([self.seed, WINDOW, number])
@@ -175,6 +177,8 @@ def loader(windows: Windows, steps: Steps, workers: int, pin: bool = False) -> D
     return DataLoader(
         windows, batch_sampler=steps, num_workers=workers, collate_fn=collate, generator=generator, pin_memory=pin,
         worker_init_fn=_quiet, prefetch_factor=4 if workers else None,
+        # fork would copy locks of threads that do not live on in the copy, once anything has been computed here
+        multiprocessing_context="forkserver" if workers else None,
     )  # fmt: skip
 
 

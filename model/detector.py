@@ -41,7 +41,8 @@ class DetectorConfig:
     dilations: tuple[int, ...] = (1, 2, 4, 8)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.channels <= 128 or not 0 < len(self.dilations) <= 8 or max(self.dilations) > 64:
+        dilations = 0 < len(self.dilations) <= 8 and all(1 <= dilation <= 64 for dilation in self.dilations)
+        if not 1 <= self.channels <= 128 or not dilations:
             raise ValueError(f"{self} is no detector; expected 1 to 128 channels and 1 to 8 dilations up to 64")
 
     def build(self) -> DropDetector:

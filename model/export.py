@@ -1,7 +1,7 @@
 """A trained generator for other programs: ONNX, and torch.export's program, both for images of any size and number.
 
 The exported graph wants sides that are multiples of `multiple`, at least `smallest_side`, as its metadata say;
-`padded` makes such images, as the generator does inside.
+`image_batch.padded` makes such images, as the generator does inside.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from rainstereo.model.generator import Generator
 from rainstereo.model.receptive_field import halo
@@ -40,17 +39,6 @@ class Padded(nn.Module):
             change = change * drawn[:, 3:].sigmoid()
         derained = images + change if self.generator.config.output_residual else (change + 1) / 2
         return derained.clamp(0, 1)
-
-
-def padded(images: Tensor, multiple: int, smallest: int) -> Tensor:
-    """Sides brought to multiples, and to the smallest, at the right and bottom: mirrored, or where the image is too
-    small for that its last row or column repeated."""
-    for axis, size in ((3, images.shape[3]), (2, images.shape[2])):
-        more = max(-size % multiple, smallest - size)
-        if more:
-            sides = (0, more, 0, 0) if axis == 3 else (0, 0, 0, more)
-            images = pad(images, sides, mode="reflect" if more < size else "replicate")
-    return images
 
 
 def program(generator: Generator) -> torch.export.ExportedProgram:

@@ -8,6 +8,8 @@ from typing import Any, Protocol, cast
 import torch
 from torch import Tensor, nn
 
+from rainstereo.model.image_batch import padded
+
 PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16, "float16": torch.float16}
 WITHOUT_A_CARD = 512
 """Halo of a network that does not say how far it looks, in pixels."""
@@ -32,7 +34,10 @@ class Network(Protocol):
 
 
 class TorchNetwork:
-    """By torch, which takes the module over: it is moved and converted. precision: "float32", "bf16", "float16" or "auto", which takes what pays on the device."""
+    """By torch, which takes the module over: it is moved and converted.
+
+    precision: "float32", "bf16", "float16" or "auto", which takes what pays on the device.
+    """
 
     def __init__(self, module: nn.Module, device: str | torch.device = "auto", precision: str = "auto") -> None:
         self.device = pick_device(device)
@@ -75,8 +80,6 @@ class OnnxNetwork:
 
     def __call__(self, images: Tensor) -> Tensor:
         """The restored images."""
-        from rainstereo.model.export import padded
-
         height, width = images.shape[2:]
         given = padded(images, self.multiple, self.smallest)
         found = self.session.run(None, {self.input: given.contiguous().numpy()})[0]

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from rainstereo.model.architecture import PUBLISHED
 from rainstereo.model.discriminator import DiscriminatorConfig
 from rainstereo.model.losses import LossWeights
 
@@ -39,7 +40,8 @@ class DataOptions:
     """Images, and what is cut from them.
 
     crop: side of the square windows, pixels; 0: whole images, which then must be of one size if batch > 1. crop_drops:
-    share of the windows that must hold drops. clear: share of windows that come without rain. workers: processes that
+    share of the windows that must hold drops. clear: share of windows that come without rain. only: train
+    on the first so many windows, again and again, and validate on them: can it learn at all? 0: on all. workers: processes that
     read and augment. align: what to do about pairs that are shifted: "refuse", "warn" or "skip" the test.
     """
 
@@ -48,6 +50,7 @@ class DataOptions:
     crop: int = 256
     crop_drops: float = 1.0
     clear: float = 0.0
+    only: int = 0
     workers: int = 1
     align: Literal["refuse", "warn", "skip"] = "refuse"
 
@@ -126,7 +129,10 @@ class ComputeOptions:
 @dataclass(frozen=True)
 class KeepOptions:
     """What is written how often, in steps; 0: never. keep: checkpoints that stay. val_limit, val_crop: validation looks at
-    so many pairs, and at the middle of them. storage: of the final weights."""
+    so many pairs, and at the middle of them. sheet: pictures of the first of them, at validations that many steps apart.
+    enough: PSNR of a validation at which the run ends; 0: none. storage: of the final weights. not_finite: what to do about
+    batches with values or gradients that are not finite.
+    """
 
     log: int = 50
     checkpoint: int = 500
@@ -135,6 +141,7 @@ class KeepOptions:
     val_limit: int = 20
     val_crop: int = 0
     sheet: int = 1000
+    enough: float = 0.0
     storage: Literal["float16", "float32"] = "float32"
     not_finite: Literal["skip", "stop"] = "skip"
 
@@ -174,6 +181,8 @@ class Recipe:
         _within("data.crop", d.crop, 0, 1 << 14)
         _within("data.crop_drops", d.crop_drops, 0, 1)
         _within("data.clear", d.clear, 0, 1)
+        _within("data.only", d.only, 0, 4096)
+        _within("keep.enough", k.enough, 0, 100)
         _within("data.workers", d.workers, 0, 64)
         _within("optimizer.rate", o.rate, 0, 10)
         _within("optimizer.beta1", o.beta1, 0, 0.9999)
@@ -213,7 +222,20 @@ def read(path: Path) -> Recipe:
 
 
 def parse(table: Mapping[str, Any]) -> Recipe:
-    """The recipe in a table of plain values, as `plain` gives it."""
+    """The recipe in a table of plain values, as `plain` gives it.
+
+    Where it does not speak of losses, discriminator or pool, they are those with which the architecture was published.
+    """
+    published = PUBLISHED.get(str(table.get("architecture", "generator")))
+    if published is not None:
+        optimizer = table.get("optimizer", {})
+        pool = {"pool": published.pool} if isinstance(optimizer, Mapping) else {}
+        table = {
+            "losses": dataclasses.asdict(published.weights),
+            "discriminator": dataclasses.asdict(published.discriminator or DiscriminatorConfig()),
+            **table,
+            "optimizer": {**pool, **optimizer} if pool else optimizer,
+        }
     found = _parse(Recipe, table, "")
     assert isinstance(found, Recipe)  # noqa: S101 - for the type checker
     return found

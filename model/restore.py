@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from rainstereo.model import checkpoint as checkpoints
+from rainstereo.model.architecture import ARCHITECTURES
 from rainstereo.model.detector import CELL, CERTAIN, THRESHOLD, Detector, factor_for
 from rainstereo.model.networks import Network, OnnxNetwork, TorchNetwork, pick_device
 from rainstereo.model.pixels import check, from_rgb, to_rgb
@@ -261,9 +262,11 @@ def opened(checkpoint: Checkpoint | None) -> checkpoints.Checkpoint:
 
 def restores(found: checkpoints.Checkpoint) -> None:
     """ValueError where a checkpoint is no de-rainer of RGB images in 0..1."""
-    role = found.card.get("role", "generator")
-    if role != "generator":
-        raise ValueError(f"{found.path} holds a {role}; expected a generator, which is what restores images")
+    if found.architecture not in ARCHITECTURES:
+        raise ValueError(
+            f"{found.path} holds {found.architecture or 'something unnamed'}; expected what restores images: "
+            + ", ".join(sorted(ARCHITECTURES))
+        )
     data = found.card.get("input", {})
     channels, span = data.get("channels", 3), list(data.get("range", (0, 1)))
     if channels != 3 or span != [0, 1]:

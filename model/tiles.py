@@ -83,11 +83,11 @@ def _merged(parts: list[Rect], call: int) -> list[Rect]:
 
 def ramped(marked: Mask, cell: int, size: tuple[int, int], ramp: int) -> Array:
     """(H, W) float32: 1 on marked cells, 0 elsewhere, rising from 0 within `ramp` pixels inside what is marked."""
-    wide = np.repeat(np.repeat(marked.astype(np.float32), cell, 0), cell, 1)[: size[0], : size[1]]
+    wide: Image = np.repeat(np.repeat(marked.astype(np.float32), cell, 0), cell, 1)[: size[0], : size[1]]
     if ramp:
         # a box of 2 r + 1 is half full at a straight edge: below one half means outside
         wide = np.clip(2 * cv2.blur(wide, (2 * ramp + 1,) * 2, borderType=cv2.BORDER_REPLICATE) - 1, 0, 1) * (wide > 0)
-    return np.asarray(wide, np.float32)  # type: ignore[return-value]
+    return np.asarray(wide, np.float32)
 
 
 # -- images that are larger than what can be computed at once ----------------------------------------------------------
@@ -119,7 +119,7 @@ class Grid:
         """Of a tile's pixels along an axis; at each pixel of the image those of all tiles add up to 1."""
         spans = self.spans(axis)
         start, end = spans[index]
-        found: Array = np.ones(end - start, np.float32)  # type: ignore[assignment]
+        found: Array = np.ones(end - start, np.float32)
         ramp = (np.arange(self.overlap, dtype=np.float32) + np.float32(0.5)) / np.float32(max(1, self.overlap))
         if index > 0:
             found[: self.overlap] = ramp[: end - start]
@@ -154,7 +154,7 @@ def strips(
     for i, (top, bottom) in enumerate(rows):
         seen = Rect(top, 0, bottom, width).grown(grid.halo, grid.size)
         source = read(seen.top, seen.bottom)
-        total: Array = np.zeros((bottom - top, *source.shape[1:]), np.float32)  # type: ignore[assignment]
+        total: Array = np.zeros((bottom - top, *source.shape[1:]), np.float32)
         down = grid.weights(0, i)
         for j, (left, right) in enumerate(columns):
             tile = Rect(top, left, bottom, right)

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from rainstereo.model import checkpoint
 from rainstereo.model.augmentation import Augmentation
 from rainstereo.model.dataset import WHOLE, Batch, Rain, Sample, Steps, Windows, loader, whole
+from rainstereo.model.misalignment import misaligned
 from rainstereo.model.pair_folders import Item, find
 from rainstereo.model.recipe import Recipe, parse, plain
 from rainstereo.model.train_step import Stepped, Trainer
@@ -91,6 +92,8 @@ def _fit(recipe: Recipe, out: Path, listener: Listener, rank: int, world: int, d
     if recipe.compute.threads:
         torch.set_num_threads(recipe.compute.threads)
     items, validation = find(recipe.data.train), find(recipe.data.val)
+    if recipe.data.align != "skip" and rank == 0:
+        _look_for_shifts(recipe, [*items, *validation], listener)
     on_device = device.type != "cpu"
     windows = Windows(items, recipe.data, recipe.rain, None if on_device else recipe.augment, recipe.seed)
     augmentation = Augmentation(recipe.augment) if on_device else None
@@ -99,7 +102,7 @@ def _fit(recipe: Recipe, out: Path, listener: Listener, rank: int, world: int, d
     run.begun_at = run.trainer.done
     log = _Table(out / LOSSES, rank == 0)
     log.cut(run.trainer.done)
-    validator = _Validator(run, listener, rank == 0)
+    validator = _Validator(run, listener, rank == 0, windows)
     listener.began(run)
     steps = Steps(run.trainer.done, recipe.steps, recipe.optimizer.batch, rank, world)
     batches = iter(loader(windows, steps, recipe.data.workers, pin=device.type == "cuda"))
@@ -194,6 +197,20 @@ def processes() -> Iterator[tuple[int, int, str]]:
 # -- parts of a run ----------------------------------------------------------------------------------------------------
 
 
+def _look_for_shifts(recipe: Recipe, items: list[Item], listener: Listener) -> None:
+    shifted = misaligned(items)
+    if not shifted:
+        return
+    worst = max(shifted, key=lambda s: s.pixels)
+    words = (
+        f"{len(shifted)} of the pairs that were looked at are shifted, such as {worst.rainy} by {worst.dx:+.1f}, "
+        f"{worst.dy:+.1f} pixels against {worst.clear}"
+    )
+    if recipe.data.align == "refuse":
+        raise ValueError(f'{words}; align them (rainstereo align), or set data.align = "warn"')
+    listener.said(words)
+
+
 def _device(recipe: Recipe, found: str) -> torch.device:
     name = found if recipe.compute.device == "auto" else recipe.compute.device
     try:
@@ -210,9 +227,10 @@ def _over(run: Run, device: torch.device) -> bool:
     """Whether all processes are to stop: the first one's clock counts."""
     if run.trainer.done >= run.recipe.steps:
         return True
-    if not run.recipe.minutes:
+    minutes, enough = run.recipe.minutes, run.recipe.keep.enough
+    if not minutes and not enough:
         return False
-    over = run.elapsed >= 60 * run.recipe.minutes
+    over = bool(minutes and run.elapsed >= 60 * minutes) or bool(enough and run.best >= enough)
     if run.trainer.world > 1:
         flag = torch.tensor([int(over)], device=device)
         torch.distributed.broadcast(flag, 0)
@@ -339,8 +357,9 @@ class _Table:
 class _Validator:
     """Looks at held-out pairs, the same each time."""
 
-    def __init__(self, run: Run, listener: Listener, looks: bool) -> None:
+    def __init__(self, run: Run, listener: Listener, looks: bool, windows: Windows) -> None:
         self.run, self.listener, self.looks = run, listener, looks
+        self.windows = windows if run.recipe.data.only else None
         recipe, count = run.recipe, len(run.validation)
         most = min(recipe.keep.val_limit or count, count)
         self.items = [run.validation[i * count // most] for i in range(most)] if most else []
@@ -351,10 +370,12 @@ class _Validator:
 
     def look(self) -> None:
         """Validate, and keep the generator if it is the best so far."""
-        if not self.items or not self.looks:
-            return
         run = self.run
-        if not self.samples:
+        if not self.looks or not (self.items or self.windows):
+            return
+        if not self.samples and self.windows is not None:
+            self.samples = [self.windows[i] for i in range(run.recipe.data.only)]
+        elif not self.samples:
             self.samples = [
                 whole(item, self.rain, _seed(run.recipe.seed, i), run.recipe.keep.val_crop)
                 for i, item in enumerate(self.items)

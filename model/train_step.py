@@ -61,6 +61,10 @@ class Trainer:
         self.average = copy.deepcopy(self.generator).requires_grad_(False) if recipe.optimizer.ema else None
         self.discriminator: nn.Module | None = None
         if recipe.losses.need_discriminator:
+            if recipe.discriminator.conditional and recipe.optimizer.pool:
+                raise ValueError(
+                    "discriminator.conditional needs optimizer.pool = 0: images from a pool are not of the rainy image's scene"
+                )
             self.discriminator = self._placed(recipe.discriminator.build())
             self.discriminator_optimizer = self._adam(self.discriminator)
             self._run_discriminator = self._replicated(self.discriminator)
@@ -128,8 +132,7 @@ class Trainer:
             shown = torch.cat([pool.query(image[None]) for pool, image in zip(pools, derained, strict=True)])
             with self._alone(self._run_discriminator, i + 1 < len(parts)):
                 with self._casting():
-                    adversary = self.recipe.losses.adversary
-                    loss = discriminator_loss(self._run_discriminator, clear, shown, rainy, adversary) / len(parts)
+                    loss = self._discriminated(clear, shown, rainy) / len(parts)
                 self.scaler.scale(loss).backward()
             total += loss.detach()
         return {"discriminator": float(total)}, self._update(self.discriminator_optimizer, rate)
@@ -146,6 +149,9 @@ class Trainer:
             for name, loss in found.items():
                 losses[name] = losses.get(name, 0) + loss.detach() / len(parts)
         return {name: float(loss) for name, loss in losses.items()}, self._update(self.generator_optimizer, rate)
+
+    def _discriminated(self, clear: Tensor, derained: Tensor, rainy: Tensor) -> Tensor:
+        return discriminator_loss(self._run_discriminator, clear, derained, rainy, self.recipe.losses.adversary)
 
     def _derained(self, rainy: Tensor) -> Tensor:
         with self._casting():

@@ -58,7 +58,7 @@ def decode(data: bytes, *, gray: bool = False) -> Image:
 
 
 def encode(suffix: str, image: Image, parameters: Sequence[int] = ()) -> bytes:
-    """The bytes of an image file. parameters: OpenCV's `imencode` flags and values; PNG is fast (level 1) without any."""
+    """The bytes of an image file. parameters: OpenCV's `imencode` flags and values; PNG without any is fast."""
     if not parameters and suffix.lower() == ".png":
         parameters = (cv2.IMWRITE_PNG_COMPRESSION, 1)
     done, data = cv2.imencode(suffix, image, parameters)

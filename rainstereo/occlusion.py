@@ -16,12 +16,15 @@ from .types import Array, Image, Mask
 FIELD, OCCLUDED, DISPLACED, VALID = 0, 64, 128, 255
 """Gray levels of a validity mask: out of a camera's field; hidden from the wet camera; seen by both but apart by more
 than the limit; nothing known against it."""
+WINDOW, ALIKE, TEXTURE, SMALLEST = 9, 0.85, 3.0, 60
+"""A match at half size is believed where windows of 9 px correlate by 0.85 or more, both show texture (gray levels),
+and 60 px of such matches hang together."""
 
 
 @dataclass(frozen=True)
 class Occlusion:
-    """How to find it. towards: +1 if near things lie to the right in the wet image (it is the left camera), -1 if to the
-    left. low, high: disparities to look for, pixels of the aligned images. limit: of what counts as in place."""
+    """How to find it. towards: +1 if near things lie to the right in the wet image (it is the left camera), -1 if to
+    the left. low, high: disparities to look for, pixels of the aligned images. limit: of what counts as in place."""
 
     towards: int
     low: float
@@ -36,7 +39,7 @@ class Occlusion:
             )
 
     def disparity(self, dry: Image, wet: Image) -> Array:
-        """How far each pixel's point lies along the baseline in the wet image, (H, W) pixels; NaN where nothing matches.
+        """How far along the baseline each pixel's point lies in the wet image, (H, W) pixels; NaN: no match.
 
         Measured at half the size, to about 0.2 px.
         """
@@ -52,11 +55,29 @@ class Occlusion:
         pad = count + max(low, 0)  # it has no answer in the first columns
         a, b = (cv2.copyMakeBorder(image, 0, 0, pad, 0, cv2.BORDER_REPLICATE) for image in (a, b))
         found = matcher.compute(a, b)[:, pad:].astype(np.float64) / 16
-        found[found < low] = np.nan
-        full = cv2.resize(
-            2 * (found if self.towards < 0 else found[:, ::-1]), dry.shape[1::-1], interpolation=cv2.INTER_NEAREST
-        )
+        found = found if self.towards < 0 else found[:, ::-1]
+        found[(found < low) | ~self._alike(half[0], half[1], found)] = np.nan
+        full = cv2.resize(2 * found, dry.shape[1::-1], interpolation=cv2.INTER_NEAREST)
         return np.asarray(full, dtype=np.float64)
+
+    def _alike(self, dry: Image, wet: Image, disparity: Array) -> Mask:
+        """Where both images look alike once the disparity is taken away: under drops matching finds only nonsense."""
+        y, x = np.indices(disparity.shape, dtype=np.float32)
+        at = np.nan_to_num(x + self.towards * disparity, nan=-1.0).astype(np.float32)
+        moved = cv2.remap(wet, at, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+        still = dry.astype(np.float32)
+
+        def mean(values: Image) -> Array:
+            return np.asarray(cv2.blur(values, (WINDOW, WINDOW)), dtype=np.float64)
+
+        a, b = mean(still), mean(moved)
+        aa, bb, ab = mean(still**2) - a**2, mean(moved**2) - b**2, mean(still * moved) - a * b
+        good = (ab > ALIKE * np.sqrt(np.maximum(aa, 0) * np.maximum(bb, 0))) & (aa > TEXTURE**2) & (bb > TEXTURE**2)
+        count, parts, facts, _ = cv2.connectedComponentsWithStats(good.astype(np.uint8), connectivity=4)
+        large = np.arange(count) > 0
+        large &= facts[:, cv2.CC_STAT_AREA] >= SMALLEST
+        near = cv2.dilate(large[parts].astype(np.uint8), np.ones((WINDOW, WINDOW), np.uint8))  # a window reaches so far
+        return np.asarray(near > 0)
 
     def mask(self, dry: Image, wet: Image, field: Mask) -> Image:
         """Validity of each pixel of the aligned pair, (H, W) uint8: FIELD, OCCLUDED, DISPLACED or VALID."""

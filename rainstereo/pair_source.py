@@ -46,9 +46,11 @@ class Moment:
 
 
 class PairSource(Protocol):
-    """A sequence of pairs. leftovers: what is wrong or has no partner, as (file, reason)."""
+    """A sequence of pairs."""
 
-    leftovers: tuple[tuple[str, str], ...]
+    @property
+    def leftovers(self) -> tuple[tuple[str, str], ...]:
+        """What is wrong or has no partner: (file, reason)."""
 
     def __len__(self) -> int: ...
 
@@ -143,6 +145,7 @@ def _files(dry: str, wet: str, sync_us: float, drive: str) -> FilePairs:
     moments = []
     for pair in pairing.pairs:
         when, then = clocks[0].get(pair.dry), clocks[1].get(pair.wet)
+        when = timestamps.in_name(pair.name) if when is None else when
         apart = then - when if when is not None and then is not None else math.nan
         if abs(apart) > sync_us:
             problems.append((str(pair.dry), f"the cameras are {abs(apart) / 1000:.1f} ms apart; at most "

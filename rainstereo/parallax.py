@@ -1,7 +1,7 @@
 """What alignment leaves: disparity by depth and place, exactly, by the rule of thumb, and against a homography.
 
-The rule of thumb is f b (1/Z - 1/Z0), Z0 being the depth of the plane in that direction. The exact figure follows a pixel
-through the chamber to its depth and back into the other camera.
+The rule of thumb is f b (1/Z - 1/Z0), Z0 being the depth of the plane in that direction. The exact figure follows a
+pixel through the chamber to its depth and back into the other camera.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ def grid(alignment: Alignment, columns: int = 16) -> tuple[Array, tuple[int, int
 
 
 def disparity(rig: Rig, alignment: Alignment, depth: float | Array, pixels: Array) -> Array:
-    """Where a point that the aligned dry image shows at `pixels`, (N, 2), lies in the wet one, minus that: (N, 2) pixels.
+    """Where a point that the aligned dry image shows at `pixels`, (N, 2), lies in the wet one, minus that, (N, 2).
 
     depth: along the dry camera's z axis, metres, a number or (N,). NaN where a camera does not see the point.
     """
     view, plane = alignment.view, alignment.plane
     at = {role: source_pixel(rig, role, view, plane) for role in ("dry", "wet")}
-    raw = at["dry"](pixels)  # type: ignore[index]
+    raw = at["dry"](pixels)
     origins, directions = backproject(raw, rig.dry, rig.chamber)
     reach = (np.asarray(depth) - origins[:, 2]) / directions[:, 2]
     points = origins + directions * reach[:, None]
     seen, _ = project(transform(rig.wet.rt_cam_ref, points), rig.wet, rig.chamber_in("wet"))
-    return _where(at["wet"], seen, pixels) - pixels  # type: ignore[index]
+    return _where(at["wet"], seen, pixels) - pixels
 
 
 def rule_of_thumb(rig: Rig, alignment: Alignment, depth: float | Array, pixels: Array) -> Array:
@@ -76,11 +76,11 @@ def _where(source: object, goal: Array, start: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class HomographyCheck:
-    """How far apart a pair lies that homographies aligned, in a scene that is exactly the plane; pixels, (N,) on `pixels`; NaN above the
-    plane's horizon.
+    """How far apart a pair lies that homographies aligned, in a scene that is exactly the plane.
 
     textbook: R - t n^T / d between undistorted images, the panels ignored. fitted: the best homography for each camera
-    that there is, fitted to the exact warp itself. shape: (rows, columns) of the pixels.
+    that there is, fitted to the exact warp itself. Both (N,) pixels on `pixels`, NaN above the plane's horizon, where
+    no homography is meant. shape: (rows, columns) of the pixels.
     """
 
     pixels: Array
@@ -98,9 +98,7 @@ def check_homography(rig: Rig, alignment: Alignment) -> HomographyCheck:
     """The exact refracted plane warp and the homographies side by side, over the aligned image."""
     view, plane = alignment.view, alignment.plane
     pixels, shape = grid(alignment, 24)
-    above = plane.points(view.unproject(pixels))[1] & (
-        plane.distance < np.inf
-    )  # of the horizon: no homography's matter
+    above = plane.points(view.unproject(pixels))[1] & (plane.distance < np.inf)  # of the horizon
     bare = replace(rig, chamber=None)
     roles: tuple[Role, Role] = ("dry", "wet")
     off: dict[str, dict[str, Array]] = {"textbook": {}, "fitted": {}}

@@ -29,8 +29,8 @@ ROUNDS = 12
 
 @dataclass(frozen=True)
 class Photometric:
-    """The map of one recording. gain, offset: by channel as in the images (B, G, R, or one), offsets in gray levels of 8
-    bits. vignetting: k2, k4. sigma: of the gains. before, after: RMS difference of drop-free blocks, gray levels."""
+    """The map of one recording. gain, offset: by channel as in the images (B, G, R, or one), offsets in gray levels of
+    8 bits. vignetting: k2, k4. sigma: of the gains. before, after: RMS difference of drop-free blocks, gray levels."""
 
     gain: tuple[float, ...]
     offset: tuple[float, ...]
@@ -50,7 +50,9 @@ class Photometric:
         unit = 1.0 if image.dtype == np.uint8 else 257.0
         shaped = cv2.multiply(image.astype(np.float32), self._map(image.shape))
         shaped = shaped * np.float32(gain) + np.float32(offset * unit)
-        return np.clip(np.rint(shaped), 0, np.iinfo(image.dtype).max).astype(image.dtype)
+        most = np.iinfo(image.dtype).max
+        rounded: Image = np.clip(np.rint(shaped), 0, most).astype(image.dtype)
+        return rounded
 
     def _for(self, channels: int) -> tuple[Array, Array]:
         if channels == len(self.gain):
@@ -62,7 +64,8 @@ class Photometric:
     def _table(self, channels: int) -> Image:
         gain, offset = self._for(channels)
         table = np.arange(256)[:, None] * gain + offset
-        return np.clip(np.rint(table), 0, 255).astype(np.uint8).reshape(256, 1, channels)
+        rounded: Image = np.clip(np.rint(table), 0, 255).astype(np.uint8).reshape(256, 1, channels)
+        return rounded
 
     @cached_property
     def _maps(self) -> dict[tuple[int, ...], Image]:
@@ -92,8 +95,8 @@ def fit(pairs: Sequence[tuple[Image, Image]], *, vignetting: bool = True) -> Pho
     known = inside & alike
     if known.sum() < FEWEST:
         raise ValueError(
-            f"only {int(known.sum())} blocks of {BLOCK} px look alike in both views, {FEWEST} are needed; align better, "
-            "or use pairs with fewer drops"
+            f"only {int(known.sum())} blocks of {BLOCK} px look alike in both views, {FEWEST} are needed; align "
+            "better, or use pairs with fewer drops"
         )
     dry, wet, r2 = dry[known], wet[known], r2[known]
     spread = float(np.diff(np.percentile(wet.mean(1), (5, 95)))[0])
@@ -102,35 +105,48 @@ def fit(pairs: Sequence[tuple[Image, Image]], *, vignetting: bool = True) -> Pho
             f"the drop-free blocks span {spread:.0f} gray levels; gain and offset need 20 at least. Use pairs with "
             "sunlit and shaded parts"
         )
-    gain, offset, k = np.ones(wet.shape[1]), np.zeros(wet.shape[1]), np.zeros(2)
-    weight = np.ones(len(wet))
-    sigma = np.zeros_like(gain)
     shape = np.stack([r2, r2**2], -1)
-    for _ in range(ROUNDS):
-        factor = (1 + shape @ k)[:, None]
-        for c in range(len(gain)):
-            design = np.stack([factor[:, 0] * wet[:, c], np.ones(len(wet))], -1)
-            normal = design.T @ (design * weight[:, None])
-            gain[c], offset[c] = np.linalg.solve(normal, design.T @ (weight * dry[:, c]))
-            left = dry[:, c] - design @ (gain[c], offset[c])
-            variance = float((weight * left**2).sum() / max(weight.sum() - 2, 1))
-            sigma[c] = np.sqrt(variance * np.linalg.inv(normal)[0, 0])
-        if vignetting:
-            scaled = (wet * gain).ravel()
-            design = np.repeat(shape, wet.shape[1], axis=0) * scaled[:, None]
-            goal = (dry - offset).ravel() - scaled
-            heavy = np.repeat(weight, wet.shape[1])
-            ridge = 1e-3 * float((heavy * scaled**2).sum()) * np.eye(2)  # r^2 and r^4 are nearly alike
-            k = np.linalg.solve(design.T @ (design * heavy[:, None]) + ridge, design.T @ (heavy * goal))
-        left = np.abs(dry - factor * wet * gain - offset).max(1)
-        scale = max(1.4826 * float(np.median(left)), 0.3)
-        weight = np.where(left < 4.685 * scale, (1 - (left / (4.685 * scale)) ** 2) ** 2, 0.0)
+    channels = wet.shape[1]
+    known_terms = 2 * channels + (2 if vignetting else 0)
+    found = np.concatenate([np.ones(channels), np.zeros(channels + 2)])  # gains, offsets, k2, k4
+    weight = np.ones(len(wet))
+    variance, normal = 0.0, np.eye(known_terms)
+    for _ in range(ROUNDS):  # Gauss-Newton, reweighted
+        left = dry - _mapped(found, wet, shape)
+        scale = max(1.4826 * float(np.median(np.abs(left).max(1))), 0.3)
+        far = np.abs(left).max(1) / (4.685 * scale)
+        weight = np.where(far < 1, (1 - far**2) ** 2, 0.0)
+        slope = _slope(found, wet, shape)[:, :, :known_terms]
+        normal = np.einsum("n,nci,ncj->ij", weight, slope, slope)
+        normal += np.diag([0.0] * 2 * channels + [1e-6 * float((wet**2).sum())] * (known_terms - 2 * channels))
+        step = np.linalg.solve(normal, np.einsum("n,nci,nc->i", weight, slope, left))
+        found[:known_terms] += step
+        variance = float((weight[:, None] * left**2).sum() / max(channels * weight.sum() - known_terms, 1))
+    sigma = np.sqrt(variance * np.diag(np.linalg.inv(normal)))[:channels]
     used = weight > 0
-    after = dry - (1 + shape @ k)[:, None] * wet * gain - offset
+    gain, offset, k = found[:channels], found[channels : 2 * channels], found[2 * channels :]
     return Photometric(
         tuple(map(float, gain)), tuple(map(float, offset)), (float(k[0]), float(k[1])), tuple(map(float, sigma)),
-        int(used.sum()), _rms((dry - wet)[used]), _rms(after[used]),
+        int(used.sum()), _rms((dry - wet)[used]), _rms((dry - _mapped(found, wet, shape))[used]),
     )  # fmt: skip
+
+
+def _mapped(found: Array, wet: Array, shape: Array) -> Array:
+    channels = wet.shape[1]
+    factor = 1 + shape @ found[2 * channels :]
+    return np.asarray(found[:channels] * factor[:, None] * wet + found[channels : 2 * channels])
+
+
+def _slope(found: Array, wet: Array, shape: Array) -> Array:
+    """Derivatives of the mapped values, (N, C), with respect to gains, offsets and vignetting: (N, C, 2 C + 2)."""
+    channels = wet.shape[1]
+    factor = 1 + shape @ found[2 * channels :]
+    slope = np.zeros((*wet.shape, 2 * channels + 2))
+    for c in range(channels):
+        slope[:, c, c] = factor * wet[:, c]
+        slope[:, c, channels + c] = 1
+        slope[:, c, 2 * channels :] = (found[c] * wet[:, c])[:, None] * shape
+    return slope
 
 
 def _blocks(dry: Image, wet: Image) -> tuple[Array, Array, Array, Mask]:
@@ -144,7 +160,7 @@ def _blocks(dry: Image, wet: Image) -> tuple[Array, Array, Array, Mask]:
     gray = [image if image.ndim == 2 else image.mean(2) for image in cut]
     a, b = (cv2.GaussianBlur(image, (0, 0), 1.0) for image in gray)  # a pixel of parallax shall not matter
 
-    def mean(image: Array) -> Array:
+    def mean(image: Image) -> Array:
         return np.asarray(cv2.resize(image, small, interpolation=cv2.INTER_AREA).ravel(), np.float64)
 
     aa, bb, ab = mean(a * a) - mean(a) ** 2, mean(b * b) - mean(b) ** 2, mean(a * b) - mean(a) * mean(b)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,6 @@ class RecordingPairs:
 
     def _opened(self) -> Any:
         if self._recording is None:
-            from .hardware.recording import open_recording
-
-            self._recording = open_recording(self.path)
+            module: Any = importlib.import_module("rainstereo.hardware.recording")  # needed by recordings alone
+            self._recording = module.open_recording(self.path)
         return self._recording

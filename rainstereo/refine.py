@@ -3,8 +3,8 @@
 A chamber that was moved does nothing to directions at infinity; a lens or a camera that was turned by a hundredth of a
 degree does. Image content tells the rotation without knowing depths: whatever its depth, a point lies on its epipolar
 line (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., section 9.2), so only shifts across the baseline count.
-That fixes pitch and roll at once; yaw, which moves things along the baseline as parallax does, is known from the keystone
-shape it has across it.
+That fixes pitch and roll at once; yaw, which moves things along the baseline as parallax does, is known from the
+keystone shape it has across it.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ SMALLEST = 0.05
 """A rotation that moves the image by less than this, pixels RMS, is not worth a correction."""
 CERTAIN = 3.0
 """Times its sigma that a rotation must move the image by to be believed."""
+FLOOR = 0.04
+"""Pixels by which a tile may be off however certain it seems."""
 ALIKE = 2.0
 """Factor on sigmas for errors that tiles share: those on slopes (a road) are all off a little to the same side."""
 PRIOR = 5e-3
@@ -37,7 +39,7 @@ class Refinement:
     """rotation: (3,) radians, of the wet camera against the rig, in the dry camera's frame. covariance: (3, 3).
 
     moved_px, sigma_px: by how much it moves the wet view, RMS over the view, and how certain that is. across_px: RMS of
-    the tiles' shifts across the baseline before and after. applied: whether it is more than chance; words: why or why not.
+    the tiles' shifts across the baseline before and after. applied: whether it is more than chance; words: why.
     """
 
     rotation: Array
@@ -78,10 +80,12 @@ def refine(votes: TileVotes, rig: Rig, view: Camera) -> Refinement:
         lever = np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None]
         error = focal * np.einsum("ij,ij->i", across / lever, turned)
         slope = -focal * np.stack([(across / lever * np.cross(axis, turned)).sum(1) for axis in np.eye(3)], -1)
-        scale = max(1.4826 * float(np.median(np.abs(error))), 0.02)
+        spread = np.hypot(votes.sigmas, FLOOR)
+        scale = spread * max(1.4826 * float(np.median(np.abs(error) / spread)), 0.5)
+        far = np.abs(error) / (4.685 * scale)
         if step == 0:
-            before = _rms(error[np.abs(error) < 4.685 * scale])
-        weight = np.where(np.abs(error) < 4.685 * scale, (1 - (error / (4.685 * scale)) ** 2) ** 2, 0) / scale**2
+            before = _rms(error[far < 1])
+        weight = np.where(far < 1, (1 - far**2) ** 2, 0) / scale**2
         normal = slope.T @ (slope * weight[:, None]) + np.eye(3) / PRIOR**2
         change = np.linalg.solve(normal, -slope.T @ (weight * error) - rotation / PRIOR**2)
         rotation = rotation + change
@@ -105,8 +109,8 @@ def refine(votes: TileVotes, rig: Rig, view: Camera) -> Refinement:
     return replace(
         found,
         applied=True,
-        words=f"the wet camera is turned by {np.degrees(np.linalg.norm(rotation)) * 60:.2f} arc minutes against the rig, "
-        f"which moves its view by {moved:.2f} +- {sigma:.2f} px",
+        words=f"the wet camera is turned by {np.degrees(np.linalg.norm(rotation)) * 60:.2f} arc minutes against the "
+        f"rig, which moves its view by {moved:.2f} +- {sigma:.2f} px",
     )
 
 

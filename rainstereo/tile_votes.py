@@ -11,14 +11,14 @@ from .align import residual_shift
 from .camera import Camera
 from .types import Array, Image, Mask
 
-TRUSTED = 0.1
-"""A tile whose shift is less certain than this, in pixels, says nothing."""
+TRUSTED = 0.3
+"""A tile whose shift is less certain than this, in pixels, says nothing. Drops leave few tiles better than 0.1."""
 
 
 @dataclass(frozen=True, eq=False)
 class TileVotes:
-    """Trusted tiles of aligned pairs: centres (N, 2) and shifts (N, 2), wet minus dry, pixels; sigmas (N,) pixels; which
-    pair each is of (N,)."""
+    """Trusted tiles of aligned pairs: centres (N, 2) and shifts (N, 2), wet minus dry, pixels; sigmas (N,) pixels; and
+    which pair each is of (N,)."""
 
     centres: Array
     shifts: Array

@@ -35,6 +35,11 @@ def from_names(paths: Sequence[Path]) -> dict[Path, int] | None:
     return {path: int(path.stem) for path in paths}
 
 
+def in_name(name: str) -> int | None:
+    """Microseconds that a name is; None for other names."""
+    return int(name) if _MICROSECONDS.fullmatch(name) else None
+
+
 def robotcar(paths: Sequence[Path]) -> Times | None:
     """Times of images that are named by them, held against the list beside the folder; None for other names.
 

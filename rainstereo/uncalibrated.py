@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -84,22 +84,21 @@ def match_features(dry: Image, wet: Image) -> tuple[Array, Array]:
 
 
 def _features(finder: cv2.SIFT, image: Image) -> tuple[Array, Image]:
-    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    if gray.dtype != np.uint8:
-        gray = (gray >> 8).astype(np.uint8)
-    found, descriptors = finder.detectAndCompute(gray, None)
-    if descriptors is None:
+    gray: Any = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    nowhere: Any = None
+    found, descriptors = finder.detectAndCompute(gray, nowhere)
+    if not found:
         return np.empty((0, 2)), np.empty((0, 128), np.float32)
-    return np.array([point.pt for point in found], dtype=np.float64).reshape(-1, 2), descriptors
+    return np.array([point.pt for point in found], dtype=np.float64).reshape(-1, 2), np.asarray(descriptors)
 
 
 def estimate(
     pairs: Sequence[tuple[Image, Image]], model: Model = "auto", far: bool = True, near: int | None = None
 ) -> PairModel:
-    """Where the wet images lie on the dry ones, all pairs voting together; images of one size, (height, width[, 3]).
+    """Where the wet images lie on the dry ones, all pairs voting together; uint8 images of one size.
 
-    far: a shift aligns the far scene, else what most of the matches show. near: to which side near things are shifted in
-    the wet image: 1 right (the wet camera stands on the left), -1 left, None: to be told from the ground.
+    far: a shift aligns the far scene, else what most of the matches show. near: to which side near things are shifted
+    in the wet image: 1 right (the wet camera stands on the left), -1 left, None: to be told from the ground.
     UnalignableError says why pairs are refused.
     """
     if not pairs:
@@ -107,13 +106,13 @@ def estimate(
     sizes = sorted({image.shape[1::-1] for pair in pairs for image in pair})
     if len(sizes) > 1:
         raise UnalignableError(f"images of {len(sizes)} sizes were given, {sizes[:4]}; expected one")
-    size = sizes[0]
+    size = sizes[0][0], sizes[0][1]
     found = [match_features(dry, wet) for dry, wet in pairs]
     here, there = (np.concatenate(part) for part in zip(*found, strict=True))
     if len(here) < FEWEST:
         raise UnalignableError(
-            f"{len(here)} features match between the images of {len(pairs)} pairs; {FEWEST} are needed. Are they of the "
-            "same moment? Use more pairs, or ones with fewer drops, or a calibration"
+            f"{len(here)} features match between the images of {len(pairs)} pairs; {FEWEST} are needed. Are they of "
+            "the same moment? Use more pairs, or ones with fewer drops, or a calibration"
         )
     moved = there - here
     agree = _vote(moved, size)
@@ -163,17 +162,16 @@ def _shifted(here: Array, moved: Array, agree: Mask, size: tuple[int, int], far:
         if level == 0.5
         else "the far scene (near things lie further to the " + ("right)" if near > 0 else "left)")
     )
+    spread = float(low - shift[0]), float(high - shift[0])
     words = f"a shift of ({shift[0]:.2f}, {shift[1]:.2f}) px aligns {what}"
-    return PairModel(
-        "shift", H, size, shift, sigma, (len(moved), len(votes)), (float(low - shift[0]), float(high - shift[0])), words
-    )
+    return PairModel("shift", H, size, shift, sigma, (len(moved), len(votes)), spread, words)
 
 
 def _nearness(here: Array, votes: Array, size: tuple[int, int]) -> int:
     """To which side near things are shifted in the wet image: 1 right, -1 left, 0 cannot be told.
 
-    The ground is near at the bottom of the image and far at the horizon, wherever that is; so the lowest quarter is held
-    against the two bands above it, which must not contradict one another.
+    The ground is near at the bottom of the image and far at the horizon, wherever that is; so the lowest quarter is
+    held against the two bands above it, which must not contradict one another.
     """
     low = here[:, 1] > 0.75 * size[1]
     bands = [votes[(here[:, 1] > a * size[1]) & (here[:, 1] <= (a + 0.15) * size[1]), 0] for a in (0.45, 0.6)]
@@ -188,10 +186,11 @@ def _nearness(here: Array, votes: Array, size: tuple[int, int]) -> int:
 
 def _homography(here: Array, there: Array) -> tuple[Array | None, Mask]:
     cv2.setRNGSeed(0)
-    H, kept = cv2.findHomography(here, there, cv2.USAC_MAGSAC, 2.0, maxIters=5000, confidence=0.999)
-    if H is None:
+    found: Any
+    found, kept = cv2.findHomography(here, there, cv2.USAC_MAGSAC, 2.0, maxIters=5000, confidence=0.999)
+    if found is None:
         return None, np.zeros(len(here), bool)
-    return np.asarray(H), kept.ravel().astype(bool)
+    return np.asarray(found), kept.ravel().astype(bool)
 
 
 def _turned(H: Array, here: Array, there: Array, inliers: Mask, size: tuple[int, int]) -> PairModel:
@@ -215,14 +214,14 @@ def _refusal(moved: Array, agree: Mask, size: tuple[int, int]) -> str:
     if in_row.mean() >= AGREEING:
         low, high = np.percentile(moved[in_row, 0], (10, 90))
         return (
-            f"the images are row-aligned, but their features are shifted by {low:.0f} to {high:.0f} px: that is parallax "
-            f"of a baseline too wide for this scene, and no warp without depths aligns it (at most "
+            f"the images are row-aligned, but their features are shifted by {low:.0f} to {high:.0f} px: that is "
+            f"parallax of a baseline too wide for this scene, and no warp without depths aligns it (at most "
             f"{PARALLAX * size[0]:.0f} px of it were accepted)"
         )
     return (
         f"{int(agree.sum())} of {len(moved)} matches agree on one shift or homography, {AGREEING:.0%} are needed: the "
-        "scene is seen with too much parallax, or through too many drops, or these are no pairs. Calibrate the rig, and "
-        "give --rig"
+        "scene is seen with too much parallax, or through too many drops, or these are no pairs. Calibrate the rig, "
+        "and give --rig"
     )
 
 

@@ -38,7 +38,7 @@ class VideoPairs:
         self._next = 0
 
     def __len__(self) -> int:
-        return self._count
+        return int(self._count)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_open": [], "_next": 0}

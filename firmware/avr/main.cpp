@@ -102,7 +102,7 @@ int main(int count, char** words) {
   fprintf(out, "%s\n", uart.terminal.name.c_str());
   fflush(out);
 
-  int shown = -1, shown_level = -1;
+  int shown = -1, seen = -1, settled = 0, shown_level = -1;
   int64_t begun = monotonic_ns();
   uint64_t slice = 0;
   while (!finished) {
@@ -117,7 +117,9 @@ int main(int count, char** words) {
         uart.next_cycle = static_cast<int64_t>(avr->cycle) + CPU_HZ / 11520;  // a byte's time at 115,200 baud
       }
       const int now = duty(avr);
-      if (trace && now != shown) {
+      settled = now == seen ? settled + 1 : 0;
+      seen = now;
+      if (trace && now != shown && settled >= 8) {  // a real timer takes both bytes of OCR1A at once, simavr's does not
         fprintf(trace, "%lld %llu %d 0 0\n", static_cast<long long>(monotonic_ns()),
                 static_cast<unsigned long long>(avr->cycle / (CPU_HZ / 1000)), now);
         fflush(trace);

@@ -134,6 +134,12 @@ struct Fuzzed {
     if (last.size() > 5 && core.executed() == executed) CHECK(core.duty() <= before || core.state() == rsp::RUN);
   }
 
+  // To the very millisecond at which the run or the host's time is over.
+  void wait_for_boundary(bool of_run) {
+    const unsigned long long at = of_run ? account.runs_until : static_cast<unsigned long long>(account.fed) + account.watchdog;
+    if (at > account.now && at - account.now < 5000) wait(static_cast<uint32_t>(at - account.now));
+  }
+
   void wait(uint32_t ms) {
     account.now += ms;
     core.poll(account.now, level_low);
@@ -172,7 +178,10 @@ extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
                  what & 32 ? number % 300 + 1 : 0, what & 32 ? number % 777 + 1 : 0, what & 64 ? number * 10 : number);
         fuzzed.command(body, 0);
         break;
-      case 4: fuzzed.wait(what & 16 ? number : number % 50); break;
+      case 4:
+        if (what & 32) fuzzed.wait_for_boundary(what & 64);
+        else fuzzed.wait(what & 16 ? number : number % 50);
+        break;
       case 5: fuzzed.retry(); break;
       case 6:
         fuzzed.send(std::string(1, static_cast<char>(rsp::STOP_BYTE)));
@@ -180,6 +189,7 @@ extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
         break;
       default:
         if (what & 16) fuzzed.level_low = !fuzzed.level_low;
+        else if (what & 128) fuzzed.send("@" + std::string(number % 200, static_cast<char>('A' + number % 26)));
         else fuzzed.command("KA", (what >> 5) & 3);
     }
   }

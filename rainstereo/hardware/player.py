@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from .frame import Event
 from .pump import WATCHDOG_MS, Pump
-from .schedule import Planned
 from .pump_log import SegmentLog
+from .schedule import Planned
 
 
 @dataclass(frozen=True)
@@ -67,20 +68,19 @@ class Player:
         planned = self._plan[self._next]
         self._next += 1
         self._due = self._begun + (planned.start_ms + planned.segment.duration_ms) / 1000
-        self._pump.run(planned.segment)
-        status = self._pump.status()
-        began = Played(
-            planned, status.host_ns - status.age_ms * 1_000_000, (status.device_ms - status.age_ms) % (1 << 32),
-            status.round_trip_s / 2,
-        )  # fmt: skip
-        self.played.append(began)
-        segment = planned.segment
-        self._note(
-            "segment", regime=planned.regime, calibrated=planned.calibrated, step=planned.step, index=self._next - 1,
-            duty=segment.duty, ramp_ms=segment.ramp_ms, on_ms=segment.on_ms, off_ms=segment.off_ms,
-            duration_ms=segment.duration_ms, planned_ms=planned.start_ms, start_host_ns=began.host_ns,
-            start_device_ms=began.device_ms, uncertainty_s=round(began.uncertainty_s, 6),
-        )  # fmt: skip
+        began = None
+        try:
+            self._pump.run(planned.segment)
+            status = self._pump.status()
+            began = Played(
+                planned,
+                status.host_ns - status.age_ms * 1_000_000,
+                (status.device_ms - status.age_ms) % (1 << 32),
+                status.round_trip_s / 2,
+            )
+            self.played.append(began)
+        finally:  # also where something came between: it may run
+            self._note("segment", index=self._next - 1, **_described(planned, began))
         return planned
 
     def stop(self, reason: str) -> None:
@@ -107,3 +107,17 @@ class Player:
     def _note(self, event: str, **values: object) -> None:
         if self._log is not None:
             self._log.write(event, **values)
+
+
+def _described(planned: Planned, began: Played | None) -> dict[str, object]:
+    """A log's entry; what is not known of the start is None."""
+    return {
+        "regime": planned.regime,
+        "calibrated": planned.calibrated,
+        "step": planned.step,
+        "planned_ms": planned.start_ms,
+        **dataclasses.asdict(planned.segment),
+        "start_host_ns": None if began is None else began.host_ns,
+        "start_device_ms": None if began is None else began.device_ms,
+        "uncertainty_s": None if began is None else round(began.uncertainty_s, 6),
+    }

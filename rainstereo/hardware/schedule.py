@@ -39,7 +39,7 @@ from .regime import DURATION_MAX_MS, DUTY_MAX, PULSE_MAX_MS, REGIMES, Regime, Se
 REST = "rest"
 """Regime under which pauses are logged."""
 MAX_BYTES = 1 << 20
-MAX_SEGMENTS = 100_000
+MAX_SEGMENTS = 20_000
 
 
 @dataclass(frozen=True)

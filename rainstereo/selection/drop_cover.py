@@ -77,8 +77,9 @@ def _exposed(dry: Image, wet: Image) -> Image:
 def _dissimilarity(first: Image, second: Image) -> Image:
     """As `appearance.dissimilarity`, of luma that is float already and from moments about zero, which is faster."""
     a, b = _blurred(first), _blurred(second)
-    s, t = _blurred(first * first) - a * a, _blurred(second * second) - b * b
-    both = _blurred(first * second) - a * b
+    s: Image = _blurred(first * first) - a * a
+    t: Image = _blurred(second * second) - b * b
+    both: Image = _blurred(first * second) - a * b
     floor = np.float32(2 * appearance.NOISE**2)
     level = 1 - (a - b) ** 2 / (a * a + b * b + floor)
     return np.asarray(1 - np.clip(level * (2 * both + floor) / (s + t + floor), 0, 1), dtype=np.float32)

@@ -412,3 +412,15 @@ def test_bench_of_refraction_in_a_process_of_its_own(tmp_path: Path) -> None:
     read = json.loads((tmp_path / "refraction" / "report.json").read_text())
     assert read["machine"]["threads"] == SINGLE_THREAD
     assert read["works"]["project"]["variants"]["project"]["error"] < 1e-12
+
+
+def test_select_stage_runs_and_our_cover_is_nearer_than_a_plain_difference() -> None:
+    from rainstereo.apps import bench_select
+
+    cover, pair, choice = bench_select.build(0, True).works
+    errors = {v.name: v.error(v.run()) for v in cover.variants}
+    assert errors["drop_cover"] < 0.06
+    assert errors["drop_cover"] < errors["plain difference"]
+    assert pair.variants[0].error(pair.variants[0].run()) == pytest.approx(errors["drop_cover"])
+    ours, theirs = (v.error(v.run()) for v in choice.variants)
+    assert ours < theirs

@@ -30,7 +30,7 @@ def network(config: GeneratorConfig = CONFIG) -> TorchNetwork:
 
 
 def saved(path: Path, **more: object) -> Path:
-    return checkpoint.save(path, generator(), {"architecture": "derain", "config": asdict(CONFIG), **more})
+    return checkpoint.save(path, generator(), {"architecture": "generator", "config": asdict(CONFIG), **more})
 
 
 class RedDetector(Detector):

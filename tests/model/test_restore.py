@@ -194,7 +194,7 @@ def test_checkpoints_for_other_data_are_refused(tmp_path: Path) -> None:
     for name, more, words in (
         ("gray", {"input": {"channels": 1}}, "1 channels"),
         ("range", {"input": {"range": [-1, 1]}}, "-1 .. 1"),
-        ("role", {"role": "discriminator"}, "holds a discriminator"),
+        ("role", {"architecture": "discriminator"}, "holds discriminator; expected what restores"),
     ):
         with pytest.raises(ValueError, match=words):
             Restorer(saved(tmp_path / name, **more), skip=False)

@@ -1,0 +1,109 @@
+"""The drop detector: files, sizes, thresholds, training; the package's own finds drops and passes clear images."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from rainstereo import imagefile
+from rainstereo.apps.cli import main
+from rainstereo.model import detector, detector_training
+from rainstereo.model.augment import RandomAdherentRain
+from rainstereo.model.detector import CELL, Detector, DetectorConfig, factor_for, grown_from, packed
+from tests.model.small_restorer import picture
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 33), (180, 240), (481, 643), (720, 960)])
+def test_a_probability_for_each_cell(size: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    found = Detector(DetectorConfig(4, (1, 2)).build())
+    for image in (picture(0, size), picture(0, size)[..., 0], picture(0, size).astype(np.uint16) * 257):
+        cells = found.probability(image)
+        assert cells.shape == (-(-size[0] // CELL), -(-size[1] // CELL))
+        assert ((cells > 0) & (cells < 1)).all()
+
+
+def test_how_far_an_image_is_averaged() -> None:
+    assert [factor_for(h, w) for h, w in ((1, 1), (240, 320), (360, 480), (480, 640), (960, 1280), (9000, 9000))] == [
+        1, 1, 2, 2, 4, 4,
+    ]  # fmt: skip
+
+
+def test_probabilities_grow_from_certain_cells() -> None:
+    for seed in range(20):
+        given = np.random.default_rng(seed).random((12, 17))
+        groups, count = ndimage.label(given >= 0.5, np.ones((3, 3)))  # an independent formulation
+        kept = [i for i in range(1, count + 1) if given[groups == i].max() >= 0.9]
+        assert np.array_equal(grown_from(given, 0.5, 0.9), np.isin(groups, kept))
+    assert not grown_from(np.full((3, 3), 0.5), 0.4, 0.6).any()
+    assert grown_from(np.full((3, 3), 0.7), 0.4, 0.6).all()
+
+
+def test_weights_survive_a_file_and_damage_is_refused(tmp_path: Path) -> None:
+    network = DetectorConfig(6, (1, 3)).build().eval()
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(packed(network))
+    image = torch.rand(1, 3, 40, 60)
+    with torch.inference_mode():
+        assert torch.allclose(detector.load(path)(image), network(image), atol=5e-3)  # half precision
+    whole = path.read_bytes()
+    for data, words in (
+        (whole[:-20], "damaged"), (b"", "damaged"), (bytes(2 << 20), "at most"),
+        (whole.replace(b"drop detector", b"drop defector"), "expected a drop"),
+        (whole.replace(b"[1, 3]", b"[1, 0]"), "."), (whole.replace(b"[1, 3]", b"[1   ]"), "does not fit"),
+    ):  # fmt: skip
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=words):
+            detector.load(path)
+    with pytest.raises(FileNotFoundError):
+        detector.load(tmp_path / "b.safetensors")
+    with pytest.raises(ValueError, match="is no detector"):
+        DetectorConfig(0)
+    with pytest.raises(ValueError, match="expected probabilities"):
+        Detector(network, threshold=2)
+
+
+def test_a_few_steps_of_training_learn_something(tmp_path: Path) -> None:
+    images = [cv2.resize(picture(i, (24, 32)), (128, 96)) for i in range(3)]
+    recipe = detector_training.Recipe(steps=40, batch=4, pool=4, size=(48, 64), rate=1e-2)
+    rain = RandomAdherentRain("large", (0.2, 0.4), rays=2, p=1.0)
+    seen: list[str] = []
+    made = detector_training.train(
+        images, [rain], recipe, DetectorConfig(8, (1, 2)), lambda what, done, total: seen.append(what)
+    )
+    assert 0 < made.loss < 0.69  # below that of a coin
+    assert seen == ["rendering"] * 4 + ["training"] * 40
+    with pytest.raises(ValueError, match="expected at least 64 x 48"):
+        detector_training.train([picture(0, (20, 20))], [rain], recipe)
+    with pytest.raises(ValueError, match="at least one of each"):
+        detector_training.train([], [rain], recipe)
+
+
+def test_the_command_trains_and_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    imagefile.write(tmp_path / "a.png", cv2.resize(picture(1, (24, 32)), (280, 210)))
+    out = tmp_path / "d.safetensors"
+    few = ("--steps", "10", "--batch", "2", "--pool", "2")
+    assert main(["detector", str(tmp_path / "a.png"), "--out", str(out), *few]) == 0
+    assert out.stat().st_size <= 200_000
+    assert detector.card(out)["training_images"] == 1
+    assert json.loads((tmp_path / "d.report.json").read_text())["bytes"] == out.stat().st_size
+    assert main(["detector", str(tmp_path / "a.png"), "--out", str(tmp_path / "d.bin")]) == 2
+    assert "ends in .safetensors" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_packages_detector_knows_rain_from_none(shared_data: Path) -> None:
+    """On frames that it was not trained on."""
+    assert detector.shipped().stat().st_size <= 200_000
+    found = Detector.shipped()
+    clear = [imagefile.read(path) for path in sorted((shared_data / "camvid11_480x360/val").iterdir())[::8]]
+    marked = [found.cells(image).mean() for image in clear]
+    assert np.mean(marked) < 0.05
+    wet = sorted((shared_data / "raindrop/robotcar_rainy").glob("left_*.png"))
+    dry = sorted((shared_data / "raindrop/robotcar_rainy").glob("right_*.png"))
+    for rainy, clear_path in zip(wet, dry, strict=True):
+        assert found.cells(imagefile.read(rainy)).mean() > 2 * found.cells(imagefile.read(clear_path)).mean()
+        assert found.cells(imagefile.read(rainy)).mean() > 0.3
