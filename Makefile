@@ -21,7 +21,11 @@ test-py312:
 firmware-test: env
 	@.ci/firmware
 	$(RUN) pytest tests/hardware tests/apps/test_pump.py
-	$(MAKE) -C firmware fuzz
+
+# Cameras over GigE Vision: Aravis's fake ones, in a network of their own; installs Debian's packages for that.
+rig-test: env
+	@.ci/rig .venv
+	$(RUN) pytest tests/hardware/test_live_rig.py tests/hardware/test_capture.py tests/hardware/test_recording.py tests/apps/test_record.py
 
 env:
 	@.ci/environment .venv

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import resource
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -60,7 +62,11 @@ def run(options: Options) -> int:
             with console.status("estimating how to align"):
                 model = job.keep_plan(make_model(options, rig, source))
         plan = realise(options, rig, model)
-        made, kept = _make(Work(source, plan.recipe, job), shard, options.workers or os.cpu_count() or 1, console)
+        clock = time.perf_counter()
+        workers = options.workers or os.cpu_count() or 1
+        made, kept = _make(Work(source, plan.recipe, job), shard, workers, console)
+        record["rate_pairs_s"] = made / (time.perf_counter() - clock)
+        record["memory_mb"] = _memory(workers)
         pairs, skipped = job.merge(len(chunks(len(source))))
         skipped = [*source.leftovers, *skipped]
         with console.status("measuring what is left"):
@@ -107,6 +113,12 @@ def _make(work: Work, shard: tuple[int, int], workers: int, console: Console) ->
             work.job.merge(len(chunks(len(work.source))))
         raise
     return made, kept
+
+
+def _memory(workers: int) -> dict[str, float]:
+    """Most memory that was resident, MB: of this process, of the largest worker, and of all together at most."""
+    own, child = (resource.getrusage(who).ru_maxrss / 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return {"this_process": own, "largest_worker": child, "at_most": own + workers * child}
 
 
 def _refuse_overlap(options: Options, source: PairSource) -> None:

@@ -25,7 +25,10 @@ STAGES: dict[str, str] = {
     "calibration": "rainstereo.apps.bench_calibration",
     "drops": "rainstereo.apps.bench_drops",
     "rain": "rainstereo.apps.bench_rain",
+    "align": "rainstereo.apps.bench_align",
+    "record": "rainstereo.apps.bench_record",
     "select": "rainstereo.apps.bench_select",
+    "train": "rainstereo.apps.bench_train",
     "derain": "rainstereo.apps.bench_derain",
 }
 """Stage -> module with `build(seed, quick) -> Stage`."""
@@ -35,12 +38,12 @@ STAGES: dict[str, str] = {
 class Options:
     """Measure every way to do the same work: run time beside error, interleaved repeats, median and spread.
 
-    Stages: refraction, warp, calibration, drops, rain, select, derain, or all. For each it writes OUT/STAGE/report.json (all
-    samples), report.html, a Markdown table and a plot of error against time; OUT/report.json sums up.
+    For each stage it writes OUT/STAGE/report.json (all samples), report.html, a Markdown table and a plot of error
+    against time; OUT/report.json sums up.
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What to measure: refraction, warp, calibration, drops, rain, select, derain, or all."""
+    """What to measure: refraction, warp, calibration, drops, rain, align, record, select, train, derain, or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15

@@ -27,7 +27,7 @@ TURN = np.radians((0.35, -0.55, 0.4))
 def build(seed: int, quick: bool) -> Stage:
     """The stage at 1280x960, or 320x240 if `quick`."""
     width, height = (320, 240) if quick else (1280, 960)
-    rig = _rig(width, height)
+    rig = bench_rig(width, height)
     alignment = plan(rig)
     pair = _photographs(width, height, seed)
     return Stage(
@@ -223,7 +223,8 @@ def _matrix(camera: Camera) -> Float:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _rig(width: int, height: int) -> Rig:
+def bench_rig(width: int, height: int) -> Rig:
+    """The stage's rig: two distorted cameras behind two panels."""
     scale, model = width / 1280, "LENSMODEL_OPENCV5"
     pose = np.array([*TURN, -BASELINE, 0.0003, -0.0002])
     dry = [1200 * scale, 1201 * scale, 641 * scale, 478 * scale, -0.11, 0.08, 4e-4, -3e-4, -0.01]

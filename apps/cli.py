@@ -60,6 +60,10 @@ COMMANDS: dict[str, Command] = {
         "rainstereo detector frames --out detector.safetensors",
     ),
     "train": Command("a de-raining network, from a recipe", "rainstereo train recipe.toml --out out/train"),
+    "record": Command(
+        "cameras and pump to a recording that survives a crash; verify, repair and export one",
+        "rainstereo record --dry aravis:DRY --wet aravis:WET --out drive",
+    ),
     "pump": Command(
         "drive the rig's pump: status, run, schedule, stop, monitor", "rainstereo pump run mist --simulate"
     ),

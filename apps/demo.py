@@ -1,4 +1,4 @@
-"""`rainstereo demo`: a digital rig is recorded, calibrated through its acrylic, aligned and rained on; one page."""
+"""`rainstereo demo`: a digital rig recorded, calibrated through its acrylic, aligned, rained on and derained; one page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rainstereo import Camera, Chamber, Rig, imagefile
-from rainstereo.apps import align, calibrate, droplets, figures, overlays, rain, simulate
+from rainstereo.apps import align, calibrate, derain, droplets, figures, overlays, rain, simulate
 from rainstereo.apps.calibrate import Clock
 from rainstereo.apps.cli import DONE
 from rainstereo.apps.report import Report, Tile
@@ -31,7 +31,7 @@ GRID = (33, 25)
 
 @dataclass(frozen=True)
 class Options:
-    """The toolkit at work without hardware: simulate, calibrate, align, drops, rain. Three minutes at most."""
+    """The toolkit at work without hardware: simulate, calibrate, align, drops, rain, derain. Three minutes at most."""
 
     out: Path
     """Folder for everything: OUT/report.html is the page to open."""
@@ -92,6 +92,9 @@ def _stages(options: Options) -> dict[str, Callable[[], int]]:
     rained = rain.Options(
         (str(drive / "wet"),), out / "rain", rig=out / "rig", f_number=F_NUMBER, seed=options.seed, overwrite=True
     )
+    restored = derain.Options(
+        (str(out / "rain" / "*.png"),), out / "derained", overwrite=True, pictures=pictures and pictures / "derain"
+    )
     return {
         "simulate": lambda: simulate.run(record),
         "calibrate through the acrylic": lambda: calibrate.run(through),
@@ -99,6 +102,7 @@ def _stages(options: Options) -> dict[str, Callable[[], int]]:
         "align": lambda: align.run(aligned),
         "drops": lambda: droplets.run(drops),
         "rain": lambda: rain.run(rained),
+        "derain": lambda: derain.run(restored),
     }
 
 
@@ -134,6 +138,7 @@ def _report(options: Options, record: Record, clock: Clock) -> None:
     _alignment(page, out)
     _drop(page, out)
     _rain(page, out)
+    record["derained"] = _derained(page, out)
     _next(page, out, clock)
     page.record(record)
     page.write(out / "report.html")
@@ -289,6 +294,32 @@ def _rain(page: Report, out: Path) -> None:
     page.compare(clear, rainy, ("clear", "rain"), "The same frame, clear and in the rain.")
 
 
+def _derained(page: Report, out: Path) -> list[dict[str, float]]:
+    """PSNR of each frame in the rain and derained, dB."""
+    names = sorted(path.name for path in (out / "derained").glob("*.png"))
+    frames = {
+        name: [imagefile.read(out / where / name) for where in ("recording/drive/wet", "rain", "derained")]
+        for name in names
+    }
+    scores = [
+        {"raw_psnr": cv2.PSNR(clear, rainy), "derained_psnr": cv2.PSNR(clear, derained)}
+        for clear, rainy, derained in frames.values()
+    ]
+    page.section(
+        "The rain removed",
+        "By the generator that rainstereo ships, in one pass; cells of the image in which no drop was found are as "
+        "they were, bit by bit. It learnt on photographs of other streets, at a third of this size.",
+    )
+    rainy, derained = (_shrunk(image, 1100) for image in frames[names[0]][1:])
+    page.compare(rainy, derained, ("rain", "derained"), "The same frame in the rain, and derained.")
+    page.table(
+        ("frame", "PSNR in the rain, dB", "derained, dB"),
+        [(name, *(f"{value:.2f}" for value in score.values())) for name, score in zip(names, scores, strict=True)],
+        "Against the clear frame, all pixels and channels.",
+    )
+    return scores
+
+
 def _next(page: Report, out: Path, clock: Clock) -> None:
     page.section("What to do with your own rig", "The same commands, your folders.")
     page.code(
@@ -296,7 +327,8 @@ def _next(page: Report, out: Path, clock: Clock) -> None:
         "    --chamber chamber.toml --out rig\n"
         "rainstereo align --dry drive/dry --wet drive/wet --rig rig --out aligned\n"
         "rainstereo droplets --rig rig --out droplets\n"
-        "rainstereo rain drive/wet --rig rig --out rain"
+        "rainstereo rain drive/wet --rig rig --out rain\n"
+        "rainstereo derain rain --out derained"
     )
     page.text(
         f"The calibration's own page is `{out / 'rig' / 'report.html'}`, the alignment's "

@@ -26,7 +26,7 @@ from rainstereo.rig import ROLES
 from rainstereo.sensor import Sensor
 from rainstereo.types import Image
 
-FOLDERS = r"truth|drive|(chessboard|charuco)(-[0-9]+)?"
+FOLDERS = r"truth|drive|live|(chessboard|charuco)(-[0-9]+)?"
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,16 @@ class Options:
     """Threads that render; 0: one a processor. Their number changes no byte."""
     overwrite: bool = False
     """Replace a recording that other options made."""
+    live: bool = False
+    """Then let the rig work live: fake cameras, the pump's firmware, and rainstereo record, into OUT/live."""
+    live_seconds: float = 60.0
+    """Seconds of the live drive, through all regimes of the pump."""
+    live_rate_hz: float = 16.0
+    """Pairs a second of the live cameras."""
+    live_schedule: Path | None = None
+    """Schedule of the pump (TOML) in place of all regimes in turn."""
+    live_codec: str = "auto"
+    """Codec of the live recordings; see rainstereo record."""
 
 
 def simulation(options: Options) -> Simulation:
@@ -81,6 +91,13 @@ def simulation(options: Options) -> Simulation:
         raise ValueError("neither boards nor drive frames were asked for; there would be nothing to see")
     if not 0 <= options.workers <= MOST_WORKERS:
         raise ValueError(f"--workers {options.workers} was given; expected 0 (one a processor) to {MOST_WORKERS}")
+    if options.live and (options.drive_frames < 2 or not options.rig.panels):
+        raise ValueError("--live needs --drive-frames 2 or more, and a chamber (--panels 1 or more)")
+    if not (1 <= options.live_rate_hz <= 100 and 1 <= options.live_seconds <= 86400):
+        raise ValueError(
+            f"--live-rate-hz {options.live_rate_hz:g} and --live-seconds {options.live_seconds:g} were given; expected "
+            "1 to 100 pairs a second and 1 to 86400 seconds"
+        )
     if not 1 <= options.supersampling <= 16:
         raise ValueError(f"--supersampling {options.supersampling} was given; expected 1 to 16")
     rig = digital_rig(options.rig, options.seed)
@@ -115,7 +132,16 @@ def run(options: Options) -> int:
     _report(options, plan, record)
     record.write(options.out / "report.json")
     console.print(f"{made} images made, {kept} kept, in {record.elapsed:.1f} s: {options.out}")
-    return 0
+    return _live(options, plan) if options.live else 0
+
+
+def _live(options: Options, plan: Simulation) -> int:
+    from rainstereo.apps.live_rig import run_live
+
+    boards = next((capture.folder for capture in plan.captures if capture.through), None)
+    return run_live(
+        options.out, boards, options.live_rate_hz, options.live_seconds, options.live_schedule, options.live_codec
+    )
 
 
 def _named(specs: tuple[str, ...]) -> dict[str, Board]:

@@ -115,6 +115,7 @@ def _name_ticks(axis: Axis) -> None:
 
 def _set_limits(which: Callable[[float, float], object], values: list[float]) -> None:
     """Limits of a logarithmic axis with room for names: a sixth beyond either end, and half a decade at the least."""
+    values = [value for value in values if value > 0]  # no logarithm where nothing is in error
     low, high = (np.log10(min(values)), np.log10(max(values))) if values else (0.0, 1.0)
     room = max(0.17 * (high - low), 0.3)
     which(10 ** (low - room), 10 ** (high + room))

@@ -1,4 +1,5 @@
-"""`rainstereo train`: a de-raining network from a recipe, on this machine's processor or GPUs; it goes on after any end."""
+"""`rainstereo train`: a de-raining network from a recipe, on this machine's processor or GPUs; it goes on after any
+end."""
 
 from __future__ import annotations
 
@@ -39,9 +40,9 @@ WINDOWS, ENOUGH = 4, 35.0
 class Options:
     """Train a de-raining network as a recipe says. What the recipe leaves out is as in the paper.
 
-    A run that was interrupted, even by kill -9, goes on from its latest checkpoint when it is repeated, and finds the same
-    losses as if nothing had happened. On several GPUs: torchrun --nproc-per-node 4 -m rainstereo.apps.cli train RECIPE.
-    See docs/training.md.
+    A run that was interrupted, even by kill -9, goes on from its latest checkpoint when it is repeated, and finds the
+    same losses as if nothing had happened. On several GPUs: torchrun --nproc-per-node 4 -m rainstereo.apps.cli train
+    RECIPE. See docs/training.md.
     """
 
     recipe: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECIPE.toml")]
@@ -76,7 +77,9 @@ def run(options: Options) -> int:
         words = f", {done.latest['psnr']:.2f} dB from {done.latest['psnr_raw']:.2f}" if done.latest else ""
         watcher.console.print(f"{done.trainer.done} steps{words}: {out / 'model.safetensors'}", soft_wrap=True)
         if not learnt:
-            watcher.console.print(f"4 windows were not learnt to {ENOUGH:g} dB; see {out / 'report.html'}", soft_wrap=True)
+            watcher.console.print(
+                f"4 windows were not learnt to {ENOUGH:g} dB; see {out / 'report.html'}", soft_wrap=True
+            )
     return DONE if learnt else FAILED
 
 
@@ -117,7 +120,8 @@ class Watcher:
         self._sheet_at = -1
         self._sheet: Image | None = None
         columns = (
-            TextColumn("train"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[words]}"), TimeElapsedColumn(),
+            TextColumn("train"), BarColumn(),
+            MofNCompleteColumn(), TextColumn("{task.fields[words]}"), TimeElapsedColumn(),
         )  # fmt: skip
         self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
         self._task: TaskID | None = None
@@ -216,7 +220,9 @@ class Watcher:
         report = Report("Training", f"{run.out.name}: {recipe.architecture}, {len(run.items)} images")
         psnr, raw = run.latest.get("psnr", float("nan")), run.latest.get("psnr_raw", float("nan"))
         if record.status != "ok":
-            report.verdict("bad", f"{WINDOWS} windows were not learnt to {ENOUGH:g} dB: {psnr:.2f} dB.", "Does not learn.")
+            report.verdict(
+                "bad", f"{WINDOWS} windows were not learnt to {ENOUGH:g} dB: {psnr:.2f} dB.", "Does not learn."
+            )
         elif run.latest:
             gain = psnr - raw
             words = f"{psnr:.2f} dB on held-out images, {gain:+.2f} dB against the rainy ones."

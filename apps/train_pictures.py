@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
 from rainstereo.apps.canvas import sheet, styled
-from rainstereo.types import Image
+from rainstereo.types import Array, Image
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,7 +23,7 @@ TALLEST = 240
 GAP = 6
 
 
-def read_table(path: Path) -> dict[str, np.ndarray]:
+def read_table(path: Path) -> dict[str, Array]:
     """Columns of a CSV file of numbers; empty where there is none. What is missing is NaN."""
     if not path.is_file():
         return {}
@@ -34,7 +34,7 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
 
 
 @styled
-def curves(losses: dict[str, np.ndarray], validation: dict[str, np.ndarray]) -> Figure:
+def curves(losses: dict[str, Array], validation: dict[str, Array]) -> Figure:
     """Losses, smoothed over a fiftieth of the run, and the PSNR of held-out images, over steps."""
     figure, (left, right) = sheet(9.0, 3.2, 1, 2)
     names = [name for name in losses if name not in ("step", "elapsed_s", "rate", "total")]
@@ -55,13 +55,13 @@ def curves(losses: dict[str, np.ndarray], validation: dict[str, np.ndarray]) -> 
     return figure
 
 
-def smoothed(values: np.ndarray) -> np.ndarray:
+def smoothed(values: Array) -> Array:
     """Running mean over a fiftieth of the values, at least one; shorter at the ends. NaN are left out."""
     width = max(1, len(values) // 50)
     known, ones = np.nan_to_num(values), np.isfinite(values).astype(float)
     kernel = np.ones(width)
     with np.errstate(invalid="ignore", divide="ignore"):
-        found: np.ndarray = np.convolve(known, kernel, "same") / np.convolve(ones, kernel, "same")
+        found: Array = np.convolve(known, kernel, "same") / np.convolve(ones, kernel, "same")
     return found
 
 
@@ -69,7 +69,10 @@ def samples(triples: list[tuple[Tensor, Tensor, Tensor]]) -> Image:
     """BGR picture, one row an image: rainy, derained, clear. Each (3, H, W) RGB, 0 to 1."""
     rows = []
     for triple in triples[:ROWS]:
-        images = [np.ascontiguousarray((t.clamp(0, 1) * 255).round().byte().numpy().transpose(1, 2, 0)[..., ::-1]) for t in triple]
+        images = [
+            np.ascontiguousarray((t.clamp(0, 1) * 255).round().byte().numpy().transpose(1, 2, 0)[..., ::-1])
+            for t in triple
+        ]
         height, width = images[0].shape[:2]
         if height > TALLEST:
             size = max(1, round(width * TALLEST / height)), TALLEST
@@ -78,4 +81,4 @@ def samples(triples: list[tuple[Tensor, Tensor, Tensor]]) -> Image:
         rows.append(np.hstack([images[0], gap, images[1], gap, images[2]]))
     most = max(row.shape[1] for row in rows)
     padded = [np.pad(row, ((0, GAP), (0, most - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
-    return cast(Image, np.vstack(padded))
+    return np.vstack(padded)

@@ -1,4 +1,5 @@
-"""Cards: small TOML texts that say what a file of weights is. Read by tomllib, written here, since Python only reads."""
+"""Cards: small TOML texts that say what a file of weights is. Read by tomllib, written here, since Python only
+reads."""
 
 from __future__ import annotations
 
@@ -41,14 +42,18 @@ def _table(table: Mapping[str, Any], prefix: str, lines: list[str]) -> None:
 
 
 def _key(key: str) -> str:
-    return key if _BARE.fullmatch(key) else json.dumps(key)
+    return key if _BARE.fullmatch(key) else _text(key)
+
+
+def _text(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _value(value: object, key: str) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        return _text(value)
     if isinstance(value, int):
         return str(value)
     if isinstance(value, float):

@@ -39,7 +39,8 @@ class DamagedCheckpointError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """What a file holds. card: as described above. tensors: by name, single precision where they were stored in half."""
+    """What a file holds. card: as described above. tensors: by name, single precision where they were stored in
+    half."""
 
     path: Path
     card: Card
@@ -82,13 +83,17 @@ class Checkpoint:
 
 
 def save(
-    path: Path_, tensors: nn.Module | Mapping[str, Tensor], card: Mapping[str, object], *, storage: torch.dtype | None = None
+    path: Path_,
+    tensors: nn.Module | Mapping[str, Tensor],
+    card: Mapping[str, object],
+    *,
+    storage: torch.dtype | None = None,
 ) -> Path:
     """Write a module's weights, or tensors by name, and their card; return the path of the .safetensors file.
 
     card: at least `architecture` and `config` where `Checkpoint.build` shall work. storage: a type in which floating
-    point tensors are kept, such as torch.float16, half the size. Whoever reads meanwhile, or after a crash, finds the old
-    checkpoint or the new one.
+    point tensors are kept, such as torch.float16, half the size. Whoever reads meanwhile, or after a crash, finds the
+    old checkpoint or the new one.
     """
     path = _weights(path)
     given = tensors.state_dict() if isinstance(tensors, nn.Module) else tensors
@@ -146,7 +151,7 @@ def checksum(tensors: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-# -- checkpoints in a row ------------------------------------------------------------------------------------------------
+# -- checkpoints in a row ---------------------------------------------------------------------------------------------
 
 _NUMBERED = re.compile(rf"step-(\d{{1,12}}){re.escape(SUFFIX)}")
 
@@ -184,7 +189,7 @@ def rotate(folder: Path_, keep: int) -> None:
         path.with_suffix(".toml").unlink(missing_ok=True)
 
 
-# -- files ----------------------------------------------------------------------------------------------------------------
+# -- files -----------------------------------------------------------------------------------------------------------
 
 
 def _weights(path: Path_) -> Path:
@@ -230,7 +235,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _versions() -> dict[str, str]:
-    found = {"torch": torch.__version__}
+    found = {"torch": str(torch.__version__)}
     for name in ("rainstereo", "kornia"):
         try:
             found[name] = importlib.metadata.version(name)

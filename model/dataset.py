@@ -1,15 +1,17 @@
 """Training windows and validation images: rainy, clear, and where the drops are.
 
-Window number n is the same whatever the number of workers, processes or restarts: its image comes from a shuffled order of
-(seed, epoch), everything else from a generator of (seed, n).
+Window number n is the same whatever the number of workers, processes or restarts: its image comes from a shuffled
+order of (seed, epoch), everything else from a generator of (seed, n).
 """
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -116,19 +118,18 @@ class Windows(Dataset[Sample]):
         if item.rainy or dry or self.rain is None:
             rainy, clear, mask = _read(item, None if dry or not item.rainy else choice % len(item.rainy))
             rainy, clear, mask = self._window(rng, rainy, clear, mask)
-            parts = tensor(rainy), tensor(clear), torch.from_numpy(_mask(rainy, clear, mask)).float()[None]
+            parts = tensor(rainy), tensor(clear), _tensor(mask[..., None])
         else:
             image = read(item.clear)
-            clear = tensor(_part(image, rng))
-            drops = self.rain(clear, seed, image.shape[1])
-            rainy_, clear_, mask_ = (t.numpy().transpose(1, 2, 0) for t in (drops[0], clear, drops[1]))
-            cut = self._window(rng, rainy_, clear_, mask_[..., 0])
-            parts = tuple(torch.from_numpy(np.ascontiguousarray(np.atleast_3d(a).transpose(2, 0, 1))) for a in cut)
+            shown = tensor(_part(image, rng))
+            rained, wet = self.rain(shown, seed, image.shape[1])
+            rainy, clear, mask = self._window(rng, _array(rained), _array(shown), _array(wet)[..., 0])
+            parts = _tensor(rainy), _tensor(clear), _tensor(mask[..., None])
         if self.augmentation is not None:
             parts = self.augmentation(*parts, seed)
         return Sample(*parts, seed, item.name)
 
-    def _window(self, rng: np.random.Generator, rainy: Array, clear: Array, mask: Array | None) -> list[Array]:
+    def _window(self, rng: np.random.Generator, rainy: Array, clear: Array, mask: Array | None) -> tuple[Any, Any, Any]:
         """The same window of all, one that holds drops if it shall; mirrored where images are smaller."""
         side = self.data.crop
         arrays = [rainy, clear, *([] if mask is None else [mask])]
@@ -147,13 +148,15 @@ class Windows(Dataset[Sample]):
                     break
             top, left = place
             arrays = [a[top : top + side, left : left + side] for a in arrays]
-        return arrays if mask is not None else [*arrays, _mask(*arrays, None)]
+        rainy, clear = arrays[:2]
+        return rainy, clear, _mask(rainy, clear, arrays[2] if mask is not None else None)
 
 
 @lru_cache(maxsize=4)
 def order(seed: int, epoch: int, count: int) -> Array:
     """The order of images in an epoch."""
-    return np.random.default_rng([seed, epoch]).permutation(count)
+    found: Array = np.random.default_rng([seed, epoch]).permutation(count)  # type: ignore[assignment]
+    return found
 
 
 class Steps(Sampler[list[int]]):
@@ -173,6 +176,8 @@ class Steps(Sampler[list[int]]):
 
 def loader(windows: Windows, steps: Steps, workers: int, pin: bool = False) -> DataLoader[Sample]:
     """Batches of `steps`, read ahead by worker processes."""
+    if workers:
+        multiprocessing.set_forkserver_preload(["rainstereo.model.dataset"])
     generator = torch.Generator()  # the loader's own, so that torch's stays as it is
     return DataLoader(
         windows, batch_sampler=steps, num_workers=workers, collate_fn=collate, generator=generator, pin_memory=pin,
@@ -188,8 +193,8 @@ def collate(samples: Sequence[Sample]) -> Batch:
     odd = next((s for s in samples if s.clear.shape != first.clear.shape), None)
     if odd is not None:
         raise ValueError(
-            f"{first.name} has {_size(first.clear)} pixels and {odd.name} {_size(odd.clear)}; a batch needs one size: set "
-            "data.crop, or optimizer.batch = 1"
+            f"{first.name} has {_size(first.clear)} pixels and {odd.name} {_size(odd.clear)}; a batch needs one "
+            "size: set data.crop, or optimizer.batch = 1"
         )
     rainy, clear, mask = (torch.stack([getattr(s, key) for s in samples]) for key in ("rainy", "clear", "mask"))
     return Batch(rainy, clear, mask, tuple(s.seed for s in samples), tuple(s.name for s in samples))
@@ -198,14 +203,13 @@ def collate(samples: Sequence[Sample]) -> Batch:
 def whole(item: Item, rain: Rain | None, seed: int, crop: int = 0) -> Sample:
     """An image for validation: the first rainy version, or rain drawn from the seed. crop: side of its middle."""
     if item.rainy or rain is None:
-        images = [_middle(a, crop) for a in _read(item, 0 if item.rainy else None)[:2]]
-        mask = torch.from_numpy(_mask(*images, None)).float()[None]
-        return Sample(tensor(images[0]), tensor(images[1]), mask, seed, item.name)
+        rainy, clear = (_middle(a, crop) for a in _read(item, 0 if item.rainy else None)[:2])
+        return Sample(tensor(rainy), tensor(clear), _tensor(_mask(rainy, clear, None)[..., None]), seed, item.name)
     image = read(item.clear)
-    clear = tensor(_part(image, np.random.default_rng([seed, WHOLE])))
-    rainy, mask = rain(clear, seed, image.shape[1])
-    parts = [torch.from_numpy(_middle(t.numpy().transpose(1, 2, 0), crop).transpose(2, 0, 1).copy()) for t in (rainy, clear, mask)]
-    return Sample(*parts, seed, item.name)
+    shown = tensor(_part(image, np.random.default_rng([seed, WHOLE])))
+    rained, wet = rain(shown, seed, image.shape[1])
+    a, b, c = (_tensor(_middle(_array(t), crop)) for t in (rained, shown, wet))
+    return Sample(a, b, c, seed, item.name)
 
 
 # -- images ------------------------------------------------------------------------------------------------------------
@@ -228,6 +232,17 @@ def tensor(image: Image) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)).astype(np.float32) / most)
 
 
+def _array(tensor: Tensor) -> Array:
+    """(H, W, C) of (C, H, W)."""
+    found: Array = tensor.numpy().transpose(1, 2, 0)
+    return found
+
+
+def _tensor(array: Array) -> Tensor:
+    """(C, H, W) float of (H, W, C)."""
+    return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1), np.float32))
+
+
 def _read(item: Item, version: int | None) -> tuple[Image, Image, Array | None]:
     """Rainy, clear and, where there is one, the mask. version None: the clear image twice."""
     clear = read(item.clear)
@@ -236,7 +251,8 @@ def _read(item: Item, version: int | None) -> tuple[Image, Image, Array | None]:
     rainy = read(item.rainy[version])
     if rainy.shape != clear.shape:
         raise ValueError(
-            f"{item.rainy[version]} has {_hw(rainy)} pixels, its clear partner {item.clear} has {_hw(clear)}; align them first"
+            f"{item.rainy[version]} has {_hw(rainy)} pixels, its clear partner {item.clear} has {_hw(clear)}; "
+            "align them first"
         )
     if rainy.dtype != clear.dtype:
         rainy, clear = _eight(rainy), _eight(clear)
@@ -256,7 +272,7 @@ def _mask(rainy: Array, clear: Array, mask: Array | None) -> Array:
     """(H, W) float, 1 where drops are: the mask, or where the images differ."""
     if mask is not None:
         return mask
-    scale = np.iinfo(clear.dtype).max if clear.dtype.kind == "u" else 1
+    scale = np.iinfo(cast(Any, clear.dtype)).max if clear.dtype.kind == "u" else 1
     difference = cv2.absdiff(rainy, clear).max(2)
     found: Array = (difference > CHANGED * scale).astype(np.float32)
     return found

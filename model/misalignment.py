@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +28,8 @@ SMALLEST = 32
 
 @dataclass(frozen=True)
 class Shift:
-    """How far the rainy image's content lies from the clear one's, in pixels of the files; how distinct that is, 0 to 1."""
+    """How far the rainy image's content lies from the clear one's, in pixels of the files; how distinct that is, 0 to
+    1."""
 
     rainy: Path
     clear: Path
@@ -72,11 +74,12 @@ def shift(rainy: Image, clear: Image) -> tuple[float, float, float, float]:
 
 def _edges(image: Image) -> Array:
     """Edges, compressed, so that neither a drop's glare nor a dull window decides."""
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+    gray: Any = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     height, width = gray.shape
     if width > ACROSS:
         size = ACROSS, max(SMALLEST, round(height * ACROSS / width))
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     x, y = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
-    edges: Array = np.log1p(20 * cv2.magnitude(x, y)).astype(np.float64)
-    return edges - edges.mean()
+    edges = np.log1p(20 * cv2.magnitude(x, y)).astype(np.float64)
+    found: Array = edges - edges.mean()
+    return found

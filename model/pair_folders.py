@@ -27,7 +27,8 @@ MOST = 10_000_000
 
 @dataclass(frozen=True)
 class Item:
-    """A clear image and rainy versions of it. rainy empty: rain is rendered. masks: where drops are, one for each rainy."""
+    """A clear image and rainy versions of it. rainy empty: rain is rendered. masks: where drops are, one for each
+    rainy."""
 
     name: str
     clear: Path

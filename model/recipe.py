@@ -1,4 +1,5 @@
-"""A training run as a TOML file: frozen dataclasses whose defaults are the paper's, and nothing unknown gets through."""
+"""A training run as a TOML file: frozen dataclasses whose defaults are the paper's, and nothing unknown gets
+through."""
 
 from __future__ import annotations
 
@@ -41,8 +42,9 @@ class DataOptions:
 
     crop: side of the square windows, pixels; 0: whole images, which then must be of one size if batch > 1. crop_drops:
     share of the windows that must hold drops. clear: share of windows that come without rain. only: train
-    on the first so many windows, again and again, and validate on them: can it learn at all? 0: on all. workers: processes that
-    read and augment. align: what to do about pairs that are shifted: "refuse", "warn" or "skip" the test.
+    on the first so many windows, again and again, and validate on them: can it learn at all? 0: on all. workers:
+    processes that read and augment. align: what to do about pairs that are shifted: "refuse", "warn" or "skip" the
+    test.
     """
 
     train: tuple[Source, ...] = ()
@@ -73,8 +75,8 @@ class AugmentOptions:
     """Augmentation by kornia. Geometric: the same for image, truth and mask. Photometric: the same for image and truth.
 
     flip: probability of mirroring left to right. rotate: degrees, at most. scale: smallest and largest. brightness,
-    contrast, saturation, hue: as in `kornia.augmentation.ColorJiggle`. noise: standard deviation of what is added to the rainy
-    image alone, of 1.
+    contrast, saturation, hue: as in `kornia.augmentation.ColorJiggle`. noise: standard deviation of what is added to
+    the rainy image alone, of 1.
     """
 
     flip: float = 0.5
@@ -91,11 +93,11 @@ class AugmentOptions:
 class OptimizerOptions:
     """Adam, for both networks.
 
-    schedule: of the rate: "constant", or "cosine" from `rate` to `final` x `rate` at the last step (with `minutes`, when
-    the time is up). warmup: steps over which the rate rises from 0. batch: windows a step, over all processes. accumulate: parts
-    that a process takes its share of the batch in. clip: largest norm of the gradient; 0: any. ema: decay of the
-    running mean of the weights, which then is what is validated and kept; 0: none. pool: earlier derained images
-    that the discriminator sees.
+    schedule: of the rate: "constant", or "cosine" from `rate` to `final` x `rate` at the last step (with `minutes`,
+    when the time is up). warmup: steps over which the rate rises from 0. batch: windows a step, over all processes.
+    accumulate: parts that a process takes its share of the batch in. clip: largest norm of the gradient; 0: any. ema:
+    decay of the running mean of the weights, which then is what is validated and kept; 0: none. pool: earlier derained
+    images that the discriminator sees.
     """
 
     rate: float = 2e-4
@@ -115,7 +117,8 @@ class OptimizerOptions:
 class ComputeOptions:
     """How it is computed. device: "auto" takes a GPU if there is one.
 
-    precision: "bf16" and "fp16" are autocast. compile: torch.compile of the generator. threads: of this process; 0:
+    precision: "bf16" and "fp16" are autocast. channels_last: where it is right, see
+    `train_step.instance_norm_differentiates`. compile: torch.compile of the generator. threads: of this process; 0:
     torch's choice.
     """
 
@@ -128,10 +131,10 @@ class ComputeOptions:
 
 @dataclass(frozen=True)
 class KeepOptions:
-    """What is written how often, in steps; 0: never. keep: checkpoints that stay. val_limit, val_crop: validation looks at
-    so many pairs, and at the middle of them. sheet: pictures of the first of them, at validations that many steps apart.
-    enough: PSNR of a validation at which the run ends; 0: none. storage: of the final weights. not_finite: what to do about
-    batches with values or gradients that are not finite.
+    """What is written how often, in steps; 0: never. keep: checkpoints that stay. val_limit, val_crop: validation
+    looks at so many pairs, and at the middle of them. sheet: pictures of the first of them, at validations that many
+    steps apart. enough: PSNR of a validation at which the run ends; 0: none. storage: of the final weights.
+    not_finite: what to do about batches with values or gradients that are not finite.
     """
 
     log: int = 50

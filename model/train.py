@@ -80,8 +80,8 @@ class Run:
 def fit(recipe: Recipe, out: Path, listener: Listener) -> Run:
     """Train until the recipe's end; goes on from the latest whole checkpoint in `out`.
 
-    Under torchrun each process takes its share of every batch. Writes, in `out`: checkpoints/, model.safetensors (latest),
-    best.safetensors (of the best validation), losses.csv, validation.csv.
+    Under torchrun each process takes its share of every batch. Writes, in `out`: checkpoints/, model.safetensors
+    (latest), best.safetensors (of the best validation), losses.csv, validation.csv.
     ValueError where the recipe and what is in `out` do not fit; RuntimeError where nothing can be learnt.
     """
     with processes() as (rank, world, device):
@@ -121,7 +121,8 @@ def _fit(recipe: Recipe, out: Path, listener: Listener, rank: int, world: int, d
         if found.skipped:
             _count_skipped(run, batch, found, in_a_row)
         if _due(done, recipe.keep.log) or done == recipe.steps:
-            log.add({"step": done, "elapsed_s": round(run.elapsed, 3), "rate": run.trainer.rate(run.progress)} | found.losses)
+            now = {"step": done, "elapsed_s": round(run.elapsed, 3), "rate": run.trainer.rate(run.progress)}
+            log.add({**now, **found.losses})
         listener.stepped(run, found)
         if _due(done, recipe.keep.validate):
             validator.look()
@@ -170,11 +171,9 @@ def card_of(run: Run) -> dict[str, Any]:
 
 def augmented(batch: Batch, augmentation: Augmentation, device: torch.device) -> Batch:
     """The batch on the device, its windows augmented there, each from its own seed."""
-    parts = [
-        augmentation(*(t.to(device, non_blocking=True) for t in window), seed)
-        for *window, seed in zip(batch.rainy, batch.clear, batch.mask, batch.seeds, strict=True)
-    ]
-    rainy, clear, mask = (torch.stack(tensors) for tensors in zip(*parts, strict=True))
+    tensors = (t.to(device, non_blocking=True) for t in (batch.rainy, batch.clear, batch.mask))
+    parts = [augmentation(a, b, c, seed) for a, b, c, seed in zip(*tensors, batch.seeds, strict=True)]
+    rainy, clear, mask = map(torch.stack, zip(*parts, strict=True))
     return dataclasses.replace(batch, rainy=rainy, clear=clear, mask=mask)
 
 

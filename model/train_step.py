@@ -1,4 +1,5 @@
-"""One step of training: the discriminator first, then the generator, each from its own losses and for its own weights."""
+"""One step of training: the discriminator first, then the generator, each from its own losses and for its own
+weights."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -52,7 +54,7 @@ class Trainer:
                 f"{recipe.optimizer.accumulate} parts; give a multiple of {world * recipe.optimizer.accumulate}"
             )
         self.config = configure(recipe.architecture, recipe.network)
-        self._format = torch.channels_last if recipe.compute.channels_last else torch.contiguous_format
+        self._format = torch.channels_last if self._may_be_channels_last() else torch.contiguous_format
         self._autocast = PRECISIONS.get(recipe.compute.precision)
         self.scaler = torch.amp.GradScaler(device.type, enabled=self._autocast is torch.float16)
         torch.manual_seed(recipe.seed)
@@ -63,7 +65,8 @@ class Trainer:
         if recipe.losses.need_discriminator:
             if recipe.discriminator.conditional and recipe.optimizer.pool:
                 raise ValueError(
-                    "discriminator.conditional needs optimizer.pool = 0: images from a pool are not of the rainy image's scene"
+                    "discriminator.conditional needs optimizer.pool = 0: images from a pool are not of the rainy "
+                    "image's scene"
                 )
             self.discriminator = self._placed(recipe.discriminator.build())
             self.discriminator_optimizer = self._adam(self.discriminator)
@@ -133,7 +136,7 @@ class Trainer:
             with self._alone(self._run_discriminator, i + 1 < len(parts)):
                 with self._casting():
                     loss = self._discriminated(clear, shown, rainy) / len(parts)
-                self.scaler.scale(loss).backward()
+                self.scaler.scale(loss).backward()  # type: ignore[no-untyped-call]
             total += loss.detach()
         return {"discriminator": float(total)}, self._update(self.discriminator_optimizer, rate)
 
@@ -170,7 +173,17 @@ class Trainer:
 
     def _placed(self, module: nn.Module) -> nn.Module:
         module = module.to(self.device)
-        return module.to(memory_format=self._format) if self.recipe.compute.channels_last else module  # type: ignore[call-overload]
+        if self._format is torch.channels_last:
+            module.to(memory_format=self._format)  # type: ignore[call-overload]
+        return module
+
+    def _may_be_channels_last(self) -> bool:
+        """Whether it is asked for, and right: see `instance_norm_differentiates`."""
+        if not self.recipe.compute.channels_last:
+            return False
+        kinds = getattr(self.config, "normalisation", "instance"), self.recipe.discriminator.normalisation
+        needed = kinds if self.recipe.losses.need_discriminator else kinds[:1]
+        return "instance" not in needed or instance_norm_differentiates(self.device)
 
     def _moved(self, images: Tensor) -> Tensor:
         return images.to(self.device, non_blocking=True, memory_format=self._format)
@@ -236,8 +249,8 @@ class Trainer:
         decay = min(self.recipe.optimizer.ema, (1 + self.done) / (10 + self.done))
         for mean, weight in zip(self.average.parameters(), self.generator.parameters(), strict=True):
             mean.lerp_(weight, 1 - decay)
-        for mean, buffer in zip(self.average.buffers(), self.generator.buffers(), strict=True):
-            mean.copy_(buffer)
+        for kept, buffer in zip(self.average.buffers(), self.generator.buffers(), strict=True):
+            kept.copy_(buffer)
 
     # -- exact resume --------------------------------------------------------------------------------------------------
 
@@ -283,6 +296,22 @@ class Trainer:
         return {name: tensor for part in found for name, tensor in part.items()}
 
 
+@lru_cache
+def instance_norm_differentiates(device: torch.device) -> bool:
+    """Whether the gradient of InstanceNorm2d is right for images in channels-last order.
+
+    For a batch of one it is not in torch 2.13 on the processor: off by as much as the gradient itself, without a word.
+    """
+    draws = torch.Generator().manual_seed(0)
+    values, slopes = (torch.randn(1, 4, 8, 8, generator=draws).to(device) for _ in range(2))
+    found = []
+    for order in (torch.contiguous_format, torch.channels_last):
+        images = values.clone(memory_format=order).requires_grad_()
+        nn.functional.instance_norm(images).backward(slopes.clone(memory_format=order))  # type: ignore[no-untyped-call]
+        found.append(images.grad)
+    return bool(torch.allclose(found[0], found[1], atol=1e-4))  # type: ignore[arg-type]
+
+
 def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     start = f"{prefix}."
     found = {name[len(start) :]: tensor for name, tensor in tensors.items() if name.startswith(start)}
@@ -311,7 +340,6 @@ def _restore_optimizer(prefix: str, optimizer: torch.optim.Optimizer, tensors: M
         parameter = parameters[int(index)]
         if tensor.shape == parameter.shape:
             kept = torch.empty_like(parameter, dtype=tensor.dtype, memory_format=torch.preserve_format)
-            tensor = kept.detach().copy_(tensor)
+            optimizer.state[parameter][key] = kept.detach().copy_(tensor)
         else:
-            tensor = tensor.clone()
-        optimizer.state[parameter][key] = tensor
+            optimizer.state[parameter][key] = tensor.clone()

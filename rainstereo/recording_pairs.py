@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,13 @@ class RecordingPairs:
 
     def __init__(self, path: str, *, drive: str = "") -> None:
         self.path, self.drive = path, drive
-        self.leftovers: tuple[tuple[str, str], ...] = ()
         self._recording: Any = None
-        self._count = len(self._opened())
+        recording = self._opened()
+        self._count = len(recording)
+        self.leftovers = tuple(
+            (f"{path}, segment {d.segment}", f"{d.what}: bytes {d.offset} to {d.end} cannot be read")
+            for d in recording.damage
+        )
 
     def __len__(self) -> int:
         return self._count
@@ -53,6 +56,7 @@ class RecordingPairs:
 
     def _opened(self) -> Any:
         if self._recording is None:
-            module: Any = importlib.import_module("rainstereo.hardware.recording")  # needed by recordings alone
-            self._recording = module.open_recording(self.path)
+            from .hardware.recording import open_recording
+
+            self._recording = open_recording(self.path)
         return self._recording

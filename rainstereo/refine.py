@@ -25,7 +25,7 @@ FEWEST = 40
 SMALLEST = 0.05
 """A rotation that moves the image by less than this, pixels RMS, is not worth a correction."""
 CERTAIN = 3.0
-"""Times its sigma that a rotation must move the image by to be believed."""
+"""Times its sigma that a component of a rotation must be to be believed."""
 FLOOR = 0.04
 """Pixels by which a tile may be off however certain it seems."""
 ALIKE = 2.0
@@ -98,16 +98,23 @@ def refine(votes: TileVotes, rig: Rig, view: Camera) -> Refinement:
     inverse = np.linalg.inv(normal)
     covariance = ALIKE**2 * inverse @ (sums.T @ sums + np.eye(3) / PRIOR**2) @ inverse
     levers = _levers(view)
-    moved = float(np.sqrt(np.mean((levers @ rotation) ** 2) * 2))
-    sigma = float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", levers, covariance, levers)) * 2))
     after = _rms(error[weight > 0])
-    found = Refinement(rotation, covariance, len(votes), moved, sigma, (before, after), False, "")
-    if moved < max(SMALLEST, CERTAIN * sigma):
-        return replace(
-            found, words=f"the rig explains the images: a rotation would move them by {moved:.3f} +- {sigma:.3f} px"
-        )
+    found = Refinement(
+        rotation, covariance, len(votes), *_size(levers, rotation, covariance), (before, after), False, ""
+    )
+    variances, axes = np.linalg.eigh(covariance)  # its components along these axes err independently
+    certain = np.abs(rotation @ axes) > CERTAIN * np.sqrt(variances)
+    kept = axes[:, certain]
+    moved, sigma = _size(levers, kept @ kept.T @ rotation, kept * variances[certain] @ kept.T)
+    if moved < SMALLEST:
+        by = f"{found.moved_px:.3f} +- {found.sigma_px:.3f} px"
+        return replace(found, words=f"the rig explains the images: a rotation would move them by {by}")
+    rotation = kept @ kept.T @ rotation
     return replace(
         found,
+        rotation=rotation,
+        moved_px=moved,
+        sigma_px=sigma,
         applied=True,
         words=f"the wet camera is turned by {np.degrees(np.linalg.norm(rotation)) * 60:.2f} arc minutes against the "
         f"rig, which moves its view by {moved:.2f} +- {sigma:.2f} px",
@@ -143,6 +150,13 @@ def _levers(view: Camera) -> Array:
     along = fx * np.stack([-x * y, 1 + x * x, -y], -1)
     down = fy * np.stack([-(1 + y * y), x * y, x], -1)
     return np.concatenate([along, down])
+
+
+def _size(levers: Array, rotation: Array, covariance: Array) -> tuple[float, float]:
+    """By how many pixels a rotation moves the view, RMS, and the sigma of that."""
+    moved = np.mean((levers @ rotation) ** 2)
+    variance = np.mean(np.einsum("ni,ij,nj->n", levers, covariance, levers))
+    return float(np.sqrt(2 * moved)), float(np.sqrt(2 * variance))
 
 
 def _rms(values: Array) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+import warnings
 from typing import Any
 
 import numpy as np
@@ -28,10 +29,12 @@ BUFFERS = 32
 def load_aravis() -> Any:
     """Aravis by GObject introspection. RuntimeError, with the remedy, where it is not installed."""
     try:
-        import gi
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ImportWarning)  # about how gi loads, on newer Pythons
+            import gi
 
-        gi.require_version("Aravis", "0.8")
-        from gi.repository import Aravis
+            gi.require_version("Aravis", "0.8")
+            from gi.repository import Aravis
     except (ImportError, ValueError) as error:
         raise RuntimeError(
             "Aravis is not installed. Get it: sudo apt-get install gir1.2-aravis-0.8 python3-gi aravis-tools, then run "

@@ -76,11 +76,12 @@ class CameraPair:
         self.cameras = dict(cameras)
         self.event = event
         shared = all(camera.shared_clock for camera in self.cameras.values())
-        self.pairer = Pairer(
-            shared_clock=shared,
-            period_ns=None if period_s is None else 1e9 * period_s,
-            grid_ns=None if grid_s is None else round(1e9 * grid_s),
-        )
+        self._pairing: dict[str, Any] = {
+            "shared_clock": shared,
+            "period_ns": None if period_s is None else 1e9 * period_s,
+            "grid_ns": None if grid_s is None else round(1e9 * grid_s),
+        }
+        self.pairer = Pairer(**self._pairing)
         self._queue: queue.Queue[Item] = queue.Queue(QUEUE)
         self._ready: list[PairFrame] = []
         self._stop = threading.Event()
@@ -243,6 +244,16 @@ class CameraPair:
         """End acquiring; `start` begins anew."""
         self._halt()
         self._was_started = False
+
+    def begin_anew(self) -> None:
+        """Stop, forget everything that was counted, and start."""
+        self.stop()
+        self.pairer = Pairer(**self._pairing)
+        for camera in self.cameras.values():
+            camera.trouble.damaged = camera.trouble.overrun = 0
+        self._ready.clear()
+        self._restarts = dict.fromkeys(ROLES, 0)
+        self.start()
 
     def close(self) -> None:
         """Stop and let go of both cameras."""

@@ -44,27 +44,29 @@ def serve(board: FrameBoard, rate_hz: float) -> list[Any]:
     library.arv_gv_fake_camera_get_fake_camera.restype = ctypes.c_void_p
     library.arv_gv_fake_camera_get_fake_camera.argtypes = [ctypes.c_void_p]
     library.arv_fake_camera_set_fill_pattern.argtypes = [ctypes.c_void_p, FILL, ctypes.c_void_p]
+    library.arv_fake_camera_get_payload.restype = ctypes.c_size_t
+    library.arv_fake_camera_get_payload.argtypes = [ctypes.c_void_p]
     kept: list[Any] = []
     for role, address in zip(ROLES, ADDRESSES, strict=True):
         camera = aravis.GvFakeCamera.new(address, f"rainstereo-{role}")
         if not camera.is_running():
             raise RuntimeError(f"no fake camera can run at {address}; is another one there, or no own network set up?")
-        fill = FILL(_fill(library, board, role, rate_hz))
         pointer = library.arv_gv_fake_camera_get_fake_camera(hash(camera))
+        fill = FILL(_fill(library, pointer, board, role, rate_hz))
         library.arv_fake_camera_set_fill_pattern(pointer, fill, None)
         kept += [camera, fill]
     return kept
 
 
-def _fill(library: Any, board: FrameBoard, role: Role, rate_hz: float) -> Any:
-    size = ctypes.c_size_t()
+def _fill(library: Any, camera: int, board: FrameBoard, role: Role, rate_hz: float) -> Any:
     frame_bytes = board.width * board.height
 
     def fill(buffer: int, *_: object) -> None:
-        target = library.arv_buffer_get_data(buffer, ctypes.byref(size))
+        target = library.arv_buffer_get_data(buffer, None)
         moment = board.newest(moment_at(time.time(), rate_hz))
-        if target and moment:
-            ctypes.memmove(target, board.address(role, moment), min(size.value, frame_bytes))
+        if target and moment:  # the buffer has room for what the camera's registers ask for, whatever the board holds
+            room = library.arv_fake_camera_get_payload(camera)
+            ctypes.memmove(target, board.address(role, moment), min(room, frame_bytes))
 
     return fill
 

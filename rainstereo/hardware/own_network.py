@@ -31,6 +31,11 @@ def run_inside(command: Sequence[str], environment: Mapping[str, str] | None = N
     ).returncode
 
 
+def wrap(command: Sequence[str]) -> list[str]:
+    """The command line that runs a command in a network of its own."""
+    return [*_unshare(), *command]
+
+
 def available() -> str:
     """ "" where such networks can be made; else why not."""
     try:

@@ -37,6 +37,7 @@ FAULTS = {
     4: "the reservoir is low",
 }
 HEARTBEAT_S = 0.25
+"""Between two signs of life; less where the watchdog is shorter than four of them."""
 LEASE_S = 2.0
 WATCHDOG_MS = 1000
 
@@ -130,6 +131,7 @@ class Pump:
         self._seq = 0
         self._lease_until = -1.0
         self._armed = False
+        self._pause_s = HEARTBEAT_S
         self._broken: PumpError | None = None
         self._wake = threading.Event()
         self._closing = threading.Event()
@@ -164,6 +166,7 @@ class Pump:
             self._broken = None
             self._expect(f"AR w={watchdog_ms}", f"w={watchdog_ms}")
             self._armed = True
+            self._pause_s = min(HEARTBEAT_S, watchdog_ms / 4000)
             self.renew()
             if self._beats and self._thread is None:
                 self._thread = threading.Thread(target=self._beat, name="pump-heartbeat", daemon=True)
@@ -375,4 +378,4 @@ class Pump:
             except PumpError as error:
                 self._disarm()
                 self._broken = self._broken or error
-            self._closing.wait(HEARTBEAT_S)
+            self._closing.wait(self._pause_s)

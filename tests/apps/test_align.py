@@ -11,6 +11,7 @@ import pytest
 from rainstereo import Rig, imagefile
 from rainstereo.apps.cli import main
 from rainstereo.pose import transform
+from rainstereo.refine import turned
 from rainstereo.refraction import project
 
 
@@ -146,3 +147,37 @@ def test_pixels_of_the_view_show_what_the_truth_says(recording: Path, tmp_path: 
             warp.map_xy[v, u] + slope[0][v, u] * (q[:, :1] - u[:, None]) + slope[1][v, u] * (q[:, 1:] - v[:, None])
         )
         np.testing.assert_allclose(predicted, seen, atol=2e-3)
+
+
+@pytest.mark.slow
+def test_a_lens_that_was_knocked_is_corrected_from_the_recording(recording: Path, tmp_path: Path) -> None:
+    """The rig as calibrated, its wet camera turned since by 3 arc minutes."""
+    truth = Rig.load(recording / "truth")
+    since = np.array([4e-4, -6e-4, 5e-4])
+    turned(truth, -since).save(tmp_path / "rig")
+    assert align(recording, tmp_path / "out", rig=tmp_path / "rig", drive=None) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    found = report["model"]["refine"]
+    assert found["applied"]
+    error = np.abs(np.array(found["rotation"]) - since)
+    assert (error[[0, 2]] < 4 * np.array(found["sigma"])[[0, 2]]).all()
+    assert (
+        error[[0, 2]] * 600 < 0.03
+    ).all()  # pixels; three pairs may be too few to tell yaw, which is then left alone
+    assert abs(report["remaining_shift_px"]["median_xy"][1]) < 0.05
+    assert found["across_px"]["after"] < 0.5 * found["across_px"]["before"]
+    assert "arc minutes" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_auto_takes_the_disparity_away_that_infinity_leaves(recording: Path, tmp_path: Path) -> None:
+    assert align(recording, tmp_path / "auto", "--plane", "auto", "--refine", "off", "--valid") == 0
+    report = json.loads((tmp_path / "auto" / "report.json").read_text())
+    fit = report["model"]["plane"]["fit"]
+    assert fit["mean_px"]["at_plane"] < 0.6 * fit["mean_px"]["at_infinity"]
+    assert report["plane"]["normal"][1] > 0.9  # most of the street's texture is its ground
+    assert set(report["disparity_px"]) == {"at_3m", "at_5m", "at_10m", "at_20m", "at_60m"}
+    assert report["homography_px"]["share_above"] == 0
+    mask = imagefile.read(tmp_path / "auto" / "valid" / "001.png")
+    assert set(np.unique(mask)) <= {0, 64, 128, 255}
+    assert 0.5 < (mask == 255).mean() < 1

@@ -23,6 +23,8 @@ def test_the_demo_shows_a_calibrated_rig_and_aligned_pairs(tmp_path: Path, capsy
     assert ignored["rms_px"] < 1.5 * modelled["rms_px"]  # which is why the reprojection error does not tell
     assert told["aligned_pairs"] == 4
     assert abs(told["remaining_shift_px"]["median_xy"][1]) < 0.05
+    for frame in told["derained"]:
+        assert frame["derained_psnr"] > frame["raw_psnr"] + 0.5
     page = (tmp_path / "demo" / "report.html").read_text()
     assert page.count("data:image") >= 12
     assert page.count("<svg") >= 3

@@ -28,12 +28,19 @@ duration_s = 0.3
 """
 
 
-@pytest.fixture
-def device() -> Iterator[SimulatedPump]:
+pytestmark = pytest.mark.usefixtures("compiled")
+
+
+@pytest.fixture(scope="module")
+def compiled() -> None:
     try:
         firmware.compiler()
     except RuntimeError as reason:
         pytest.skip(str(reason))
+
+
+@pytest.fixture
+def device(compiled: None) -> Iterator[SimulatedPump]:
     with SimulatedPump() as simulated:
         yield simulated
 
@@ -131,10 +138,6 @@ def test_monitor_sees_the_device_vanish_and_come_back(tmp_path: Path) -> None:
 
 
 def test_simulate_needs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    try:
-        firmware.compiler()
-    except RuntimeError as reason:
-        pytest.skip(str(reason))
     assert pump("run", "large", "--simulate", "--duration-s", "0.3", out=tmp_path) == 0
     assert "not calibrated" in capsys.readouterr().out
 

@@ -10,8 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rainstereo import timestamps
+from rainstereo.hardware.recording_writer import RecordingWriter
 from rainstereo.pair_source import BadPairError, FilePairs, open_source
+from rainstereo.recording_pairs import RecordingPairs
 from rainstereo.video_pairs import VideoPairs
+from tests.hardware.stamped import number_in, pair
 
 START = 1_535_202_904_410_922
 
@@ -136,3 +139,34 @@ def test_videos_run_in_step_and_read_in_any_order(tmp_path: Path) -> None:
         open_source(str(dry), str(tmp_path))
     with pytest.raises(ValueError, match="frames are no pairs"):
         open_source(str(dry), str(video(tmp_path / "slow.avi", 7, 8.0)))
+
+
+def test_a_recording_of_ours_is_a_source(tmp_path: Path) -> None:
+    folder = tmp_path / "rec"
+    with RecordingWriter(folder, {}) as writer:
+        for i in range(5):
+            writer.write(pair(i))
+    source = pickle.loads(pickle.dumps(open_source(str(folder), str(folder), drive="monday")))  # noqa: S301 - our own bytes
+    assert isinstance(source, RecordingPairs)
+    assert (len(source), source.leftovers) == (5, ())
+    for i in (3, 0):
+        moment, dry, wet = source.read(i)
+        assert number_in(dry) == number_in(wet) == i
+        when = (1_000_000_000 + i * 62_500_000) // 1000
+        assert moment == source.moment(i)
+        assert (moment.name, moment.timestamp_us, moment.drive) == (f"{i:06d}", when, "monday")
+        assert (moment.regime, moment.sync_us) == ("mist", 13.0)
+    segment = max(folder.iterdir(), key=lambda path: path.stat().st_size)
+    data = bytearray(segment.read_bytes())
+    data[len(data) // 2] ^= 4
+    segment.write_bytes(data)
+    broken = open_source(str(folder), str(folder))
+    bad = []
+    for i in range(len(broken)):
+        try:
+            broken.read(i)
+        except BadPairError as error:
+            bad.append(error.file)
+    assert 1 <= len(bad) + len(broken.leftovers) <= 2
+    with pytest.raises(ValueError, match="a recording holds both cameras"):
+        open_source(str(folder), str(tmp_path))

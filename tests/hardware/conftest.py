@@ -12,8 +12,9 @@ from rainstereo.hardware.firmware import SimulatedPump
 from rainstereo.hardware.pump import Pump
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _built() -> None:
+@pytest.fixture(scope="session")
+def compiled() -> None:
+    """The firmware's core can be built here."""
     try:
         firmware.compiler()
     except RuntimeError as reason:
@@ -21,7 +22,7 @@ def _built() -> None:
 
 
 @pytest.fixture
-def device() -> Iterator[SimulatedPump]:
+def device(compiled: None) -> Iterator[SimulatedPump]:
     with SimulatedPump() as simulated:
         yield simulated
 

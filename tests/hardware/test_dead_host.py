@@ -15,6 +15,8 @@ from rainstereo.hardware.firmware import SimulatedPump
 from rainstereo.hardware.pump import LeaseExpiredError, Pump, PumpError
 from rainstereo.hardware.regime import Segment
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 FULL = Segment(1000, 600_000)
 
 

@@ -10,6 +10,8 @@ from rainstereo.hardware.pump import NoAnswerError, PumpError, RefusedError
 from rainstereo.hardware.regime import Segment
 from tests.hardware.virtual_pump import Noise, VirtualPump
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 LONG = Segment(700, 600_000)
 
 

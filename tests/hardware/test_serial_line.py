@@ -13,6 +13,8 @@ from rainstereo.hardware.pump import NoAnswerError, Pump, PumpError
 from rainstereo.hardware.regime import Segment
 from rainstereo.hardware.serial_line import PortError, SerialLine, send_stop_byte
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 
 def test_the_second_opener_is_refused(device: SimulatedPump, pump: Pump) -> None:
     pump.arm()
