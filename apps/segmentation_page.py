@@ -139,7 +139,7 @@ def _section(page: Report, one: SetResult) -> None:
     page.table(
         ("", *(names.get(h, h) for h in heads), f"95 % of {one.unit}", *(f"theirs: {w}" for w in PAPER[one.task])),
         rows,
-        "Right of the interval stands what Porav, Bruls and Newman (ICRA 2019) report for their networks on their images: "
+        "Right of it stands what Porav, Bruls and Newman (ICRA 2019) report for their networks on their images: "
         "other data, and far more of it. It shows the size of things, and compares no networks. The interval is the "
         "bootstrap over test images alone; another training gives other numbers, too.",
         numbers=range(1, 2 + len(heads) + len(PAPER[one.task])),

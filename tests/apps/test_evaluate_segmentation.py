@@ -86,9 +86,7 @@ def test_one_command_makes_the_table_and_keeps_what_it_made(
         total = np.zeros((2, 2), np.int64)
         for name in one["conditions"][condition]["each"]:
             predicted = out / "markings-drive/predicted" / condition.lower() / f"{name}.png"
-            total += confusion(
-                imagefile.read(out / f"markings-drive/targets/{name}.png"), imagefile.read(predicted), 2
-            )
+            total += confusion(imagefile.read(out / f"markings-drive/targets/{name}.png"), imagefile.read(predicted), 2)
         assert one["conditions"][condition]["iou"] == pytest.approx(binary(total).iou)
         assert one["conditions"][condition]["tested"] == state
     rainy, derained = (imagefile.read(out / f"markings-drive/{s}/images/s_09.png") for s in ("rainy", "derained"))
@@ -138,7 +136,7 @@ def test_what_makes_no_sense_is_refused(weights: Path, tmp_path: Path, capsys: p
         (numbered / name).parent.mkdir(parents=True, exist_ok=True)
         imagefile.write(numbered / f"{name}.png", np.zeros((40, 40), np.uint8))
     for given, words in (
-        ((), "required"),
+        ((), "no set was given"),
         ((str(folder),), "expected markings:FOLDER or semantic:FOLDER"),
         ((f"lanes:{folder}",), "expected markings:FOLDER or semantic:FOLDER"),
         ((f"markings:{tmp_path / 'none'}",), "is no folder"),

@@ -111,13 +111,13 @@ def pattern(folder: Path, count: int = 4, size: tuple[int, int] = (48, 64)) -> l
 
 def test_it_learns_a_pattern(tmp_path: Path) -> None:
     examples = pattern(tmp_path)
-    training = Training(120, 4, 48, zoom=1, rate=0.01)
+    training = Training(60, 4, 32, zoom=1, rate=0.02)
     network = train(UNET, examples, training, tmp_path / "net.safetensors", "k", CPU)
     total = np.zeros((2, 2), np.int64)
     for example in examples:
         found = predict(network, imagefile.read(example.variants[0]), CPU)
         total += confusion(imagefile.read(example.target), found, 2)
-    assert binary(total).iou > 0.9
+    assert binary(total).iou > 0.7
     again, card = load(tmp_path / "net.safetensors")
     assert np.array_equal(predict(again, imagefile.read(examples[0].variants[0]), CPU),
                           predict(network, imagefile.read(examples[0].variants[0]), CPU))  # fmt: skip
@@ -156,7 +156,9 @@ def test_a_killed_training_goes_on_as_if_nothing_had_been(config: UNetConfig | D
 
 def test_windows_do_not_depend_on_how_many_variants_there_are(tmp_path: Path) -> None:
     examples = pattern(tmp_path, 5)
-    both = [Example((*e.variants, e.target.with_name(e.target.name.replace("truth", "dark"))), e.target) for e in examples]
+    both = [
+        Example((*e.variants, e.target.with_name(e.target.name.replace("truth", "dark"))), e.target) for e in examples
+    ]
     training = Training(10, 5, 32)
     one, two = Windows(examples, training), Windows(both, training)
     taken = 0
