@@ -78,8 +78,8 @@ def run(options: Options) -> int:
     record = Record("evaluate segmentation", options)
     if options.limit < 0 or options.width < 0 or 0 < options.width < 32:
         raise ValueError(
-            f"--limit {options.limit} --width {options.width} were given; expected a limit of 0 or more, and a width of 0 "
-            "or at least 32"
+            f"--limit {options.limit} --width {options.width} were given; expected a limit of 0 or more, and a width "
+            "of 0 or at least 32"
         )
     rain = RenderedRain(options.preset, options.psnr, options.seed)
     rain.renderer()  # says what is wrong with it

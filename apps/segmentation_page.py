@@ -14,7 +14,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from rainstereo import imagefile
-from rainstereo.apps.canvas import BAD, DRY, GOOD, PEER, SERIES, WET, sheet, styled
+from rainstereo.apps.canvas import BAD, DRY, GOOD, INK, PEER, SERIES, WET, sheet, styled
 from rainstereo.apps.report import Cell, Report, Tile
 from rainstereo.apps.run_record import Record
 from rainstereo.apps.segmentation_networks import CONDITIONS, Scored, main_score
@@ -139,7 +139,7 @@ def _section(page: Report, one: SetResult) -> None:
     page.table(
         ("", *(names.get(h, h) for h in heads), f"95 % of {one.unit}", *(f"theirs: {w}" for w in PAPER[one.task])),
         rows,
-        "Right of the interval stands what Porav, Bruls and Newman (ICRA 2019) report for their networks on their images: "
+        "Right of it stands what Porav, Bruls and Newman (ICRA 2019) report for their networks on their images: "
         "other data, and far more of it. It shows the size of things, and compares no networks. The interval is the "
         "bootstrap over test images alone; another training gives other numbers, too.",
         numbers=range(1, 2 + len(heads) + len(PAPER[one.task])),
@@ -179,11 +179,12 @@ def score_figure(one: SetResult) -> Figure:
         s, value = one.scored[c.name], _score(one, c.name)
         if math.isfinite(value):
             axes.barh(i, value, color=COLOURS[c.name], height=0.62, alpha=0.45 if c.ours else 1)
+            ink = INK if c.ours else "white"
             axes.annotate(
-                _number(value), (0, i), (5, 0), textcoords="offset points", va="center", color="white", fontsize=8.5
+                _number(value), (0, i), (5, 0), textcoords="offset points", va="center", color=ink, fontsize=8.5
             )
         if math.isfinite(s.low):
-            axes.plot([s.low, s.high], [i, i], color="#1d2733", linewidth=1.2)
+            axes.plot([s.low, s.high], [i, i], color=INK, linewidth=1.2)
     axes.set_yticks(range(len(CONDITIONS)), [c.name.lower() for c in reversed(CONDITIONS)])
     axes.set(xlabel=one.unit, xlim=(0, None))
     axes.grid(False, axis="y")

@@ -95,7 +95,7 @@ def find(folder: Path, limit: int = 0) -> LabelledSet:
         train, test = split_in_time(_beside(folder, "images", "labels", ("_L", "")))
     else:
         raise ValueError(
-            f"{folder} holds none of the layouts that are known: train/ and trainannot/ (camvid11), images/ and labels/ "
+            f"{folder} holds none of the known layouts: train/ and trainannot/ (camvid11), images/ and labels/ "
             "(camvid32), leftImg8bit/ and gtFine/ (cityscapes)"
         )
     for what, scenes in (("train on", train), ("test on", test)):
@@ -105,7 +105,7 @@ def find(folder: Path, limit: int = 0) -> LabelledSet:
 
 
 def split_in_time(scenes: Sequence[Scene], tested: float = TESTED, gap: int = GUARD) -> tuple[list[Scene], list[Scene]]:
-    """(train, test): the first frames of each drive and, after a gap, the last. A drive is what names say before `_`."""
+    """(train, test): the first frames of each drive and, after a gap, the last. Names say the drive before `_`."""
     drives: dict[str, list[Scene]] = {}
     for scene in sorted(scenes, key=lambda scene: scene.name):
         drives.setdefault(scene.name.rpartition("_")[0], []).append(scene)

@@ -1,6 +1,6 @@
 """How well a segmentation fits: confusion matrices, and what is read off them.
 
-A set's score is that of the sum of its images' matrices, as Cityscapes and PASCAL VOC define it, not the mean of scores.
+A set's score is that of the sum of its images' matrices, as in Cityscapes and PASCAL VOC, not the mean of scores.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ frames.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -43,9 +44,9 @@ class Example:
 
 @dataclass(frozen=True)
 class Training:
-    """steps of `batch` windows of `crop` x `crop` pixels (0: whole images), zoomed by up to `zoom`, mirrored half of the
-    time, lightness and contrast changed by up to `light`. AdamW from `rate` down a half cosine to 0. keep: steps between
-    states from which a run goes on."""
+    """steps of `batch` windows of `crop` x `crop` pixels (0: whole images), zoomed by up to `zoom`, mirrored half
+    of the time, lightness and contrast changed by up to `light`. AdamW from `rate` down a half cosine to 0. keep: steps
+    between states from which a run goes on."""
 
     steps: int = 4000
     batch: int = 8
@@ -74,8 +75,8 @@ def train(
 ) -> nn.Module:  # fmt: skip
     """The trained network, in eval mode; also in `path` (NAME.safetensors), from where `load` has it.
 
-    key: of whatever the network depends on. While it is trained, its state lies beside `path`; a run that was interrupted
-    goes on from there if the key is the same. told: steps done, of how many.
+    key: of whatever the network depends on. While it is trained, its state lies beside `path`; a run that was
+    interrupted goes on from there if the key is the same. told: steps done, of how many.
     RuntimeError where the loss is no number; ValueError where images and labels do not fit.
     """
     if not examples:
@@ -172,7 +173,7 @@ class Windows:
         height, width = labels.shape
         if self.training.crop:
             zoom = self.training.zoom ** (2 * draw[1] - 1)
-            own = round(self.training.crop / zoom)
+            own = math.ceil(self.training.crop / zoom)
             h, w = min(height, own), min(width, own)
             top, left = int(draw[2] * (height - h + 1)), int(draw[3] * (width - w + 1))
             image, labels = (a[top : top + h, left : left + w] for a in (image, labels))
