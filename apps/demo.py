@@ -1,4 +1,4 @@
-"""`rainstereo demo`: a digital rig recorded, calibrated through its acrylic, aligned, rained on and derained; one page."""
+"""`rainstereo demo`: a digital rig recorded, calibrated through acrylic, aligned, rained on and derained; one page."""
 
 from __future__ import annotations
 

@@ -15,14 +15,14 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from rainstereo.apps.record import Record
+from rainstereo.apps.run_record import Record
 from rainstereo.hardware.firmware import SimulatedPump
 from rainstereo.hardware.frame import STOP_BYTE, Event
 from rainstereo.hardware.player import Player
 from rainstereo.hardware.pump import WATCHDOG_MS, Pump, Status
+from rainstereo.hardware.pump_log import SegmentLog
 from rainstereo.hardware.regime import DURATION_MAX_MS, REGIMES, Regime, Segment
 from rainstereo.hardware.schedule import Planned, Schedule, Step
-from rainstereo.hardware.segment_log import SegmentLog
 from rainstereo.hardware.serial_line import PortError, PumpError, send_stop_byte
 
 ACTIONS = ("status", "run", "schedule", "stop", "monitor")

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rainstereo.hardware import firmware
+from rainstereo.hardware.pump_log import SegmentLog, read
 from rainstereo.hardware.regime import DURATION_MAX_MS, REGIMES, Regime, Segment
 from rainstereo.hardware.schedule import REST, Limits, Schedule, Step
-from rainstereo.hardware.segment_log import SegmentLog, read
 
 FULL = """
 seed = 7
