@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rainstereo import imagefile
 from rainstereo.apps.rain_frames import stamp
 from rainstereo.apps.segmentation_stages import Prepared, Told, digest, kept
+from rainstereo.types import Image
 
 if TYPE_CHECKING:
     import torch
@@ -121,11 +123,13 @@ def score(
     binary = learner.task == "markings"
     main = (lambda matrix: metrics.binary(matrix).iou) if binary else metrics.mean_iou
     matrices, predicted = [], {}
+
+    def found(path: Path) -> Image:
+        return predict(network, imagefile.read(path), learner.device)
+
     for frame in frames:
         source = frame.states[condition.tested]
-        path = kept(
-            folder, frame.name, identity, [source], lambda s=source: predict(network, imagefile.read(s), learner.device)
-        )
+        path = kept(folder, frame.name, identity, [source], partial(found, source))
         predicted[frame.name] = path
         matrices.append(metrics.confusion(imagefile.read(frame.target), imagefile.read(path), len(learner.names)))
         told(f"{learner.task}: test", 1, len(frames) * len(CONDITIONS))

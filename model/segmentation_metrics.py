@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 VOID = 255
 """Label of pixels that do not count."""
-Labels = npt.NDArray[np.integer]
+Labels = npt.NDArray[np.integer[Any]]
 Confusion = npt.NDArray[np.int64]
 
 

@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from rainstereo import imagefile
 from rainstereo.model import checkpoint
+from rainstereo.model.card import Card
 from rainstereo.model.deeplab import DeepLabConfig
 from rainstereo.model.pixels import check, to_rgb
 from rainstereo.model.segmentation import LabelImage
@@ -94,7 +95,7 @@ def train(
         images, targets = windows.batch(step)
         loss = loss_of(network(images.to(device)), targets.to(device))
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         value = float(loss.detach())
         if not np.isfinite(value):
@@ -192,7 +193,7 @@ def save(path: Path, network: nn.Module, key: str, training: Training, curve: Se
     checkpoint.save(path, network, _card(network, key) | {"training": asdict(training), "losses": list(curve)})
 
 
-def load(path: Path) -> tuple[nn.Module, checkpoint.Card]:
+def load(path: Path) -> tuple[nn.Module, Card]:
     """A network in eval mode and its card. FileNotFoundError; ValueError for what is no segmentation network."""
     found = checkpoint.load(path)
     kind = ARCHITECTURES.get(found.architecture)
