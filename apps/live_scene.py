@@ -10,14 +10,11 @@ with its standard input.
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import cv2
 import numpy as np
@@ -25,6 +22,7 @@ import numpy as np
 from rainstereo import Rig
 from rainstereo.apps.rain_presets import PRESETS
 from rainstereo.apps.rain_settings import Rain
+from rainstereo.hardware.companion import READY, Companion
 from rainstereo.hardware.fake_cameras import moment_at
 from rainstereo.hardware.frame_board import FrameBoard
 from rainstereo.hardware.pixel_format import mosaic
@@ -139,7 +137,7 @@ def draw_for_ever(rig: Rig, images: Path, board: FrameBoard, rate_hz: float, tra
         due = moment_at(time.time(), rate_hz) + AHEAD
         if done >= due:
             if done - begun >= AHEAD and begun:
-                print("ready", flush=True)
+                print(READY, flush=True)
                 begun = 0
             over.wait(0.25 / rate_hz)
             continue
@@ -161,33 +159,18 @@ def _wet(view: WetView | None, water: Water, colour: Image, clear: Image) -> Ima
     return mosaic(view.plan(water.regime, level).apply(colour), PIXEL_FORMAT)
 
 
-class LiveScene:
+class LiveScene(Companion):
     """The process, as a context; it is ready when this is made."""
 
     def __init__(self, rig: Path, images: Path, board: FrameBoard, rate_hz: float, trace: Path | None = None) -> None:
-        words = [sys.executable, "-m", "rainstereo.apps.live_scene", str(rig), str(images), str(board.path)]
-        words += [repr(rate_hz), *([str(trace)] if trace is not None else [])]
-        self.process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        answer = self.process.stdout.readline().strip() if self.process.stdout else ""
-        if answer != "ready":
-            self.close()
-            raise RuntimeError(f"the live scene did not start: {' '.join(words)}")
-
-    def close(self) -> None:
-        """Lights out."""
-        self.process.kill()
-        self.process.wait()
-        for stream in (self.process.stdin, self.process.stdout):
-            if stream is not None:
-                stream.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+        arguments = [
+            str(rig),
+            str(images),
+            str(board.path),
+            repr(rate_hz),
+            *([str(trace)] if trace is not None else []),
+        ]
+        super().__init__("the live scene", "rainstereo.apps.live_scene", arguments)
 
 
 def main() -> int:

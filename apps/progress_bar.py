@@ -16,10 +16,13 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+Advance = Callable[[str, int, int], None]
+"""What is done, how many more of it are, and how many there will be (0: nobody knows)."""
+
 
 @contextmanager
-def progress_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Gives what is to be told: what is done, how many more of it are, and how many there will be (0: nobody knows)."""
+def progress_bar(console: Console) -> Iterator[Advance]:
+    """Gives what is to be told of the work."""
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
         TimeElapsedColumn(), TimeRemainingColumn(),

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from rainstereo import imagefile
 from rainstereo.apps.cli import DONE, FAILED
+from rainstereo.apps.progress_bar import Advance, progress_bar
 from rainstereo.apps.rain_claim import claim, key_of, known_share, note_share, set_key
 from rainstereo.apps.rain_frames import Note, Outputs, failure, finished
 from rainstereo.apps.rain_motion import Drive, Sequence, frames, render_video, video_size
@@ -64,7 +55,7 @@ def run(options: Options) -> int:
     console = Console(stderr=True)
     notes: list[Note] = []
     met: Met | None = None
-    with _bar(console) as advance:
+    with progress_bar(console) as advance:
         if images:
             work = Work(rain, outputs, drive)
             if rain.psnr is not None and (drive is not None or options.psnr_over == "set"):
@@ -131,24 +122,6 @@ def _part(sources: list[Source], shard: tuple[int, int]) -> list[Source]:
 
 Advance = Callable[[str, int, int], None]
 """What is done, how many more of it are, and how many there will be."""
-
-
-@contextmanager
-def _bar(console: Console) -> Iterator[Advance]:
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(), TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def advance(what: str, count: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=total or None, rate="")
-            speed = bar.tasks[bar.task_ids.index(tasks[what])].speed
-            bar.update(tasks[what], advance=count, rate=f"{speed:.2f}/s" if speed else "")
-
-        yield advance
 
 
 def _images(work: Work, images: list[Source], shard: tuple[int, int], workers: int, advance: Advance) -> list[Note]:

@@ -12,16 +12,15 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import math
-import subprocess
 import sys
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from rainstereo.rig import ROLES, Role
 
 from .aravis_camera import load_aravis
+from .companion import READY, Companion
 from .frame_board import FrameBoard
 from .own_network import ADDRESSES
 
@@ -71,33 +70,12 @@ def _fill(library: Any, camera: int, board: FrameBoard, role: Role, rate_hz: flo
     return fill
 
 
-class FakeCameras:
+class FakeCameras(Companion):
     """The process, as a context. Open its cameras as aravis:127.0.0.1 (dry) and aravis:127.0.0.2 (wet)."""
 
     def __init__(self, board: FrameBoard, rate_hz: float) -> None:
-        words = [sys.executable, "-m", "rainstereo.hardware.fake_cameras", str(board.path)]
-        words += [str(board.width), str(board.height), repr(rate_hz)]
-        self.process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        answer = self.process.stdout.readline().strip() if self.process.stdout else ""
-        if answer != "ready":
-            self.close()
-            raise RuntimeError(f"the fake cameras did not start: {' '.join(words)}")
-
-    def close(self) -> None:
-        """Unplug both."""
-        self.process.kill()
-        self.process.wait()
-        for stream in (self.process.stdin, self.process.stdout):
-            if stream is not None:
-                stream.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+        arguments = [str(board.path), str(board.width), str(board.height), repr(rate_hz)]
+        super().__init__("the fake cameras", "rainstereo.hardware.fake_cameras", arguments)
 
 
 def main() -> int:
@@ -105,7 +83,7 @@ def main() -> int:
     path, width, height, rate = sys.argv[1:]
     with FrameBoard(Path(path), int(width), int(height)) as board:
         kept = serve(board, float(rate))
-        print("ready", flush=True)
+        print(READY, flush=True)
         sys.stdin.read()
         del kept
     return 0
