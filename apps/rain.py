@@ -120,9 +120,6 @@ def _part(sources: list[Source], shard: tuple[int, int]) -> list[Source]:
 
 # -- the work ----------------------------------------------------------------------------------------------------------
 
-Advance = Callable[[str, int, int], None]
-"""What is done, how many more of it are, and how many there will be."""
-
 
 def _images(work: Work, images: list[Source], shard: tuple[int, int], workers: int, advance: Advance) -> list[Note]:
     """Notes of all images of the shard, and of those that other shards have finished in the same folder."""
