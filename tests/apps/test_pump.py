@@ -14,7 +14,7 @@ import pytest
 from rainstereo.apps import cli
 from rainstereo.hardware import firmware
 from rainstereo.hardware.firmware import SimulatedPump
-from rainstereo.hardware.segment_log import read
+from rainstereo.hardware.pump_log import read
 
 SCHEDULE = """
 [[step]]

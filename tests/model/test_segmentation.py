@@ -59,7 +59,7 @@ def test_neighbours_in_time_never_teach_and_test() -> None:
 def test_what_is_no_data_set_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no folder"):
         find(tmp_path / "none")
-    with pytest.raises(ValueError, match="none of the layouts"):
+    with pytest.raises(ValueError, match="none of the known layouts"):
         find(tmp_path)
     put(tmp_path, "train/a.png", "trainannot/a.png")
     with pytest.raises(ValueError, match="has no image with a label to test on"):
