@@ -164,7 +164,7 @@ def test_interrupted_recordings_are_closed(folders: Path, tmp_path: Path) -> Non
         assert process.stdout.readline().endswith(b"waiting\n")
         time.sleep(0.7)
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=30)
+        process.communicate(timeout=120)
         assert process.returncode == 0
     assert open_recording(tmp_path / "rec").about["ended"] == "interrupted"
     assert len(open_recording(tmp_path / "rec")) == 12
