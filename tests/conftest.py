@@ -1,9 +1,14 @@
 """Fixtures that every folder of tests shares."""
 
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # started in a shell's background, where commands that tests interrupt would inherit that nobody can
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
