@@ -127,8 +127,8 @@ def help_text(commands: Mapping[str, Command]) -> str:
     return f"""\
 usage: rainstereo COMMAND [options]
 
-A narrow-baseline stereo rig that looks through rain: calibrate it through its acrylic, and turn its
-recordings into aligned wet and dry pairs.
+A narrow-baseline stereo rig that looks through rain: calibrate it through its acrylic, record, turn its
+recordings into aligned wet and dry pairs, render rain, and train and run what takes it away.
 
 commands:
 {listed}
