@@ -40,6 +40,8 @@ class Options:
     """Folders that rainstereo rain --masks made of these images, to learn from in place of rain on crops of them."""
     out: Path = Path("detector.safetensors")
     """File to write."""
+    start: Path | None = None
+    """Weights of an earlier run to go on with, in place of random ones."""
     steps: int = 4500
     """Training steps."""
     batch: int = 8
@@ -58,12 +60,13 @@ def run(options: Options) -> int:
     for name, low in (("steps", 10), ("batch", 2), ("pool", 2), ("seed", 0)):
         if getattr(options, name) < low:
             raise ValueError(f"--{name} {getattr(options, name)} was given; expected {low} or more")
-    named = {source.name: imagefile.read(source.path) for source in find(options.images) if not source.is_video}
-    named = {name: image for name, image in named.items() if image.ndim == 3 and image.dtype == "uint8"}
-    images = list(named.values())
     from rainstereo.model import detector, detector_training
     from rainstereo.model.card import to_toml
 
+    start = None if options.start is None else detector.load(options.start)
+    named = {source.name: imagefile.read(source.path) for source in find(options.images) if not source.is_video}
+    named = {name: image for name, image in named.items() if image.ndim == 3 and image.dtype == "uint8"}
+    images = list(named.values())
     recipe = detector_training.Recipe(options.steps, options.batch, options.pool, seed=options.seed)
     console, last = Console(stderr=True), {"rendering": 0, "reading": 0, "training": 0}
     with progress_bar(console) as told:
@@ -73,7 +76,7 @@ def run(options: Options) -> int:
             last[what] = done
 
         rain = banked(named, options.banks, options.seed) if options.banks else rains()
-        made = detector_training.train(images, rain, recipe, told=progress)
+        made = detector_training.train(images, rain, recipe, told=progress, start=start)
     data = detector.packed(made.network)
     if len(data) > MOST_BYTES:
         raise ValueError(f"the weights have {len(data)} bytes; expected {MOST_BYTES} at most")

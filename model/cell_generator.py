@@ -20,7 +20,7 @@ from torch.nn import functional
 from rainstereo.model.convolution_blocks import ResidualBlock
 from rainstereo.model.generator import Generator, GeneratorConfig
 from rainstereo.model.image_batch import RGB
-from rainstereo.types import Array, Image, Mask
+from rainstereo.types import Image, Mask
 
 AS_MATRIX = 3
 """Side of the window, in places, up to which a convolution is one product of matrices, zeros and all: faster there."""
@@ -28,7 +28,9 @@ AS_MATRIX = 3
 
 def supported(config: GeneratorConfig) -> bool:
     """Whether a generator can be computed by cells: zeros at borders, and nothing that looks at the whole image."""
-    return config.normalisation != "instance" and config.padding == "zeros" and config.stem_kernel <= 2 * config.multiple
+    return (
+        config.normalisation != "instance" and config.padding == "zeros" and config.stem_kernel <= 2 * config.multiple
+    )
 
 
 class CellGenerator:
@@ -164,9 +166,7 @@ class _Places:
             down, right = steps[:, None] // size, steps[None] // size
             beyond = -(-max(before, after) // size)
             padded = np.pad(self.numbers, beyond, constant_values=-1)
-            cells = padded[
-                self.rows[:, None, None] + down + beyond, self.columns[:, None, None] + right + beyond
-            ]
+            cells = padded[self.rows[:, None, None] + down + beyond, self.columns[:, None, None] + right + beyond]
             inside = steps[:, None] % size * size + steps[None] % size
             index = np.where(cells < 0, len(self.rows) * size * size, cells * size * size + inside)
             self._known[key] = torch.from_numpy(index.reshape(-1)).to(self.device)

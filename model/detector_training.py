@@ -79,11 +79,13 @@ def train(
     recipe: Recipe | None = None,
     config: DetectorConfig | None = None,
     told: Told = lambda what, done, total: None,
+    start: DropDetector | None = None,
 ) -> Trained:
     """Train on clear images, uint8 BGR, all larger than the crops; rains are drawn from evenly.
 
     rains: rain to put on crops of these images; or in its place images under rain, of which any number is asked for.
-    told: what is being done, how much of it is done, of how much. The same seed gives the same network on one machine.
+    told: what is being done, how much of it is done, of how much. start: a network to go on with; it is changed.
+    The same seed gives the same network on one machine.
     """
     recipe, config = recipe or Recipe(), config or DetectorConfig()
     if not images or not rains:
@@ -96,7 +98,7 @@ def train(
         else:
             pool = rendered(images, rains, recipe.pool, recipe.size, draws, told)
         held = max(1, len(pool.crops) // 16)
-        network = config.build().train()
+        network = (start or config.build()).train()
         rest = Pool(pool.crops[held:], pool.labels[held:], pool.weights[held:])
         losses = _fit(network, rest, images, recipe, draws, told)
     network.eval()
@@ -185,7 +187,8 @@ def _pooled(found: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Pool:
 
 
 def crop(images: Sequence[Image], size: tuple[int, int], draws: np.random.Generator) -> Image:
-    """A part of one of the images, between the crop's own size and the whole, averaged down to that size; mirrored."""
+    """A part of one of the images, between the crop's own size and the whole, averaged down to that size; mirrored.
+    Images may have any number of channels."""
     image = images[int(draws.integers(len(images)))]
     height, width = image.shape[:2]
     most = min(height / size[0], width / size[1])
@@ -196,8 +199,9 @@ def crop(images: Sequence[Image], size: tuple[int, int], draws: np.random.Genera
     top, left = int(draws.integers(height - rows + 1)), int(draws.integers(width - columns + 1))
     part = image[top : top + rows, left : left + columns]
     part = part[:, ::-1] if draws.random() < 0.5 else part
-    found: Image = cv2.resize(np.ascontiguousarray(part), size[::-1], interpolation=cv2.INTER_AREA)
-    return found
+    layers = [part[..., first : first + 3] for first in range(0, part.shape[2], 3)]  # OpenCV takes 4 at most
+    small = [cv2.resize(np.ascontiguousarray(layer), size[::-1], interpolation=cv2.INTER_AREA) for layer in layers]
+    return small[0] if len(small) == 1 else np.dstack(small)
 
 
 def spoiled(image: Image, draws: np.random.Generator) -> Image:

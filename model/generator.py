@@ -190,7 +190,6 @@ class Generator(nn.Module):
     def with_gate(self, images: Tensor) -> tuple[Tensor, Tensor | None]:
         """The derained images, and what gated the change, (B, 1, H, W) in 0..1, where the network draws it."""
         check(images)
-        height, width = images.shape[2:]
         drawn = self.drawn(padded(images, self.config.multiple, self.config.smallest_side))
         return self.drawn_on(images, drawn)
 

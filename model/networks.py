@@ -21,9 +21,10 @@ WITHOUT_A_CARD = 512
 class Network(Protocol):
     """Restores (B, 3, H, W) RGB in 0..1, to the same shape in float32.
 
-    cells: computes some cells of an image only, where that can be done; else None. device: where it wants its input. multiple: sides that it computes on are multiples of this; tiles must begin on
+    device: where it wants its input. multiple: sides that it computes on are multiples of this; tiles must begin on
     one. halo: pixels to the farthest that an output depends on. local: whether nothing else matters, so that a tile
-    with its halo comes out as in the whole image. name: for reports.
+    with its halo comes out as in the whole image. name: for reports. cells: computes some cells of an image alone,
+    where that can be done.
     """
 
     device: torch.device

@@ -6,8 +6,8 @@
     clear = restorer(cv2.imread("photo.png"))
 
 An image without drops costs the detector and a copy, and comes back bit for bit; so does every cell of 16 pixels of
-any image in which the detector sees no drop. What is left is computed cell by cell, or, by networks that cannot do that,
-in rectangles with some of the image around them.
+any image in which the detector sees no drop. What is left is computed cell by cell, or, by networks that cannot do
+that, in rectangles with some of the image around them.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from rainstereo.model import checkpoint as checkpoints
 from rainstereo.model.architecture import ARCHITECTURES
 from rainstereo.model.cell_generator import CellGenerator, patches
 from rainstereo.model.detector import CELL, CERTAIN, THRESHOLD, Detector, factor_for
+from rainstereo.model.image_batch import INPUT
 from rainstereo.model.networks import Network, OnnxNetwork, TorchNetwork, pick_device
 from rainstereo.model.pixels import check, from_batch, from_rgb, to_batch, to_rgb
 from rainstereo.model.tiles import Grid, Rect, Rows, coarser, covering, ramped, strips
@@ -186,19 +187,20 @@ class Restorer:
         return Restored(out, float(cells.mean()), sum(part.area for part in plan) / _area(image))
 
     def _cell_by_cell(self, image: Image, cells: Mask, where: Mask, out: Image) -> int:
-        """Restore the marked cells, of which each lies in a cell `where` something is computed; how many pixels were."""
+        """Restore the marked cells, which lie in the cells `where` something is computed; how many pixels were."""
         made = self.by_cells
         assert made is not None  # noqa: S101
         given = patches(image, where, made.cell, made.border)
         inner = slice(made.border, made.border + made.cell)
         restored = from_batch(made(to_batch(given, self.network.device), where), given[:, inner, inner])
         weight = ramped(cells, CELL, (image.shape[0], image.shape[1]), RAMP)
-        for found, row, column in zip(restored, *np.nonzero(where), strict=True):
+        for whole, row, column in zip(restored, *np.nonzero(where), strict=True):
             rows = slice(row * made.cell, (row + 1) * made.cell)
             columns = slice(column * made.cell, (column + 1) * made.cell)
             mix, before = weight[rows, columns], out[rows, columns]
-            mix, found = mix[..., None] if out.ndim == 3 else mix, found[: len(before), : before.shape[1]]
-            before[...] = np.rint(before + mix * (found.astype(np.float32) - before))
+            mix = mix[..., None] if out.ndim == 3 else mix
+            found = whole[: before.shape[0], : before.shape[1]].astype(np.float32)
+            before[...] = np.rint(before + mix * (found - before))
         return len(restored) * made.cell**2
 
     def whole(self, image: Image) -> Image:
@@ -297,10 +299,12 @@ def restores(found: checkpoints.Checkpoint) -> None:
             f"{found.path} holds {found.architecture or 'something unnamed'}; expected what restores images: "
             + ", ".join(sorted(ARCHITECTURES))
         )
-    data = found.card.get("input", {})
-    channels, span = data.get("channels", 3), list(data.get("range", (0, 1)))
-    if channels != 3 or span != [0, 1]:
+    told = found.card.get("input", {})  # cards without it are of RGB in 0 .. 1
+    told = told if isinstance(told, dict) else {"channels": told}
+    wrong = ", ".join(f"{name} {told[name]}" for name, ours in INPUT.items() if told.get(name, ours) != ours)
+    if wrong:
         raise ValueError(
-            f"{found.path} is for images of {channels} channels with values in {span[0]} .. {span[-1]}; photographs "
-            "come as 3 channels in 0 .. 1. Take another checkpoint"
+            f"{found.path} is for other images than photographs are: {wrong}; expected "
+            + ", ".join(f"{name} {ours}" for name, ours in INPUT.items())
+            + ". Take another checkpoint"
         )

@@ -192,8 +192,10 @@ def test_checkpoints_for_other_data_are_refused(tmp_path: Path) -> None:
     good = saved(tmp_path / "good")
     assert np.array_equal(Restorer(good, skip=False)(picture()), restorer()(picture()))
     for name, more, words in (
-        ("gray", {"input": {"channels": 1}}, "1 channels"),
-        ("range", {"input": {"range": [-1, 1]}}, "-1 .. 1"),
+        ("gray", {"input": {"channels": 1}}, "channels 1; expected channels 3"),
+        ("range", {"input": {"range": [-1, 1]}}, r"range \[-1, 1\]; expected"),
+        ("blue", {"input": {"colour": "bgr", "channels": 3}}, "colour bgr"),
+        ("words", {"input": "photographs"}, "photographs"),
         ("role", {"architecture": "discriminator"}, "holds discriminator; expected what restores"),
     ):
         with pytest.raises(ValueError, match=words):
