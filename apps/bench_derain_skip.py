@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -21,6 +22,11 @@ from rainstereo.model.frame_sequence import FrameSequence
 from rainstereo.model.networks import Network
 from rainstereo.model.restore import CELLS_HALO, Restored, Restorer
 from rainstereo.types import Array, Image, Mask
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rainstereo.model.cell_generator import CellGenerator
 
 TENTH = 0.1
 """Share of a frame that drops cover in the middle cases."""
@@ -178,11 +184,12 @@ class _Rectangles:
     """A network that cannot compute single cells."""
 
     def __init__(self, network: Network) -> None:
-        self.device, self.name, self.cells = network.device, network.name, None
+        self.cells: CellGenerator | None = None
+        self.device, self.name = network.device, network.name
         self.multiple, self.halo, self.local = network.multiple, network.halo, network.local
         self.run = network
 
-    def __call__(self, images):  # type: ignore[no-untyped-def]
+    def __call__(self, images: Tensor) -> Tensor:
         return self.run(images)
 
 

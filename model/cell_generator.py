@@ -200,7 +200,7 @@ def _mirrored(image: Image, down: int, right: int) -> Image:
 
 
 def _first(step: nn.Module) -> nn.Module:
-    return cast(nn.Module, cast(nn.Sequential, step)[0])
+    return cast(nn.Sequential, step)[0]
 
 
 def _after(step: nn.Sequential, features: Tensor, begin: int = 1) -> Tensor:

@@ -203,7 +203,7 @@ class Generator(nn.Module):
         change, gate = drawn[:, :seen].tanh(), None
         if self.config.output_gate:
             opened = drawn[:, seen:].sigmoid()
-            change = (change.unflatten(1, (RGB, -1)) * opened[:, None]).flatten(1, 2)
+            change = change * opened.repeat(1, RGB, 1, 1)
             gate = self._pixels(opened)[:, :, :height, :width]
         change = self._pixels(change)[:, :, :height, :width]
         derained = images + change if self.config.output_residual else (change + 1) / 2

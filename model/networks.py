@@ -83,7 +83,7 @@ class OnnxNetwork:
             raise ValueError(f"{path} is not a de-rainer that rainstereo exported; make one with rainstereo export")
         self.device, self.name = torch.device("cpu"), f"onnxruntime {onnxruntime.__version__}, {path.name}"
         self.multiple, self.halo, self.local = int(told["multiple"]), int(told["halo"]), told["local"] == "yes"
-        self.cells = None
+        self.cells: CellGenerator | None = None
         self.smallest, self.input = int(told["smallest_side"]), inputs[0].name
 
     def __call__(self, images: Tensor) -> Tensor:

@@ -41,7 +41,8 @@ def to_batch(images: Image, device: torch.device) -> Tensor:
 
 def from_rgb(rgb: Tensor, like: Image) -> Image:
     """(3, H, W) in 0..1 as an image of the type and channels of another; gray is the mean of the channels."""
-    return from_batch(rgb.unsqueeze(0), like[None])[0]
+    found: Image = from_batch(rgb.unsqueeze(0), like[None])[0]
+    return found
 
 
 def from_batch(rgb: Tensor, like: Image) -> Image:

@@ -12,6 +12,7 @@ that, in rectangles with some of the image around them.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ import numpy as np
 import torch
 
 from rainstereo.model import checkpoint as checkpoints
+from rainstereo.model import detector
 from rainstereo.model.architecture import ARCHITECTURES
 from rainstereo.model.cell_generator import CellGenerator, patches
 from rainstereo.model.detector import CELL, CERTAIN, THRESHOLD, Detector, factor_for
@@ -259,6 +261,13 @@ def _pasted(out: Image, restored: Image, part: Rect, cells: Mask) -> Image:
     mixed = given + weight * (restored.astype(np.float32) - given)
     out[part.slices] = np.rint(mixed)
     return out
+
+
+def leaves_out() -> str:
+    """Changes when anything does that decides, by default, which cells are left as they are."""
+    weights = detector.shipped().read_bytes()
+    settings = THRESHOLD, CERTAIN, CELLS_HALO, PARTS_HALO, RAMP, BY_CELLS, WHOLE, CALL
+    return hashlib.sha256(weights + repr(settings).encode()).hexdigest()
 
 
 # -- checkpoints -------------------------------------------------------------------------------------------------------
