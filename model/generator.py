@@ -185,29 +185,32 @@ class Generator(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """The derained images."""
-        return self.with_gate(images)[0]
+        check(images)
+        return self.drawn_on(images, self.drawn(padded(images, self.config.multiple, self.config.smallest_side)))[0]
 
     def with_gate(self, images: Tensor) -> tuple[Tensor, Tensor | None]:
         """The derained images, and what gated the change, (B, 1, H, W) in 0..1, where the network draws it."""
         check(images)
         drawn = self.drawn(padded(images, self.config.multiple, self.config.smallest_side))
-        return self.drawn_on(images, drawn)
+        derained, opened = self.drawn_on(images, drawn)
+        height, width = images.shape[2:]
+        return derained, None if opened is None else self._pixels(opened)[:, :, :height, :width]
 
     def drawn_on(self, images: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The derained images, and what gated the change, from what the head drew, at least as large as the images.
+        """The derained images, and what gated the change, (B, patch^2, H / patch, W / patch), from what the head drew,
+        which is at least as large as the images.
 
         Everything that is bounded is so before channels become pixels: in that order a processor is thrice as fast.
         """
         height, width = images.shape[2:]
         seen = RGB * self.config.patch**2
-        change, gate = drawn[:, :seen].tanh(), None
+        change, opened = drawn[:, :seen].tanh(), None
         if self.config.output_gate:
             opened = drawn[:, seen:].sigmoid()
             change = change * opened.repeat(1, RGB, 1, 1)
-            gate = self._pixels(opened)[:, :, :height, :width]
         change = self._pixels(change)[:, :, :height, :width]
         derained = images + change if self.config.output_residual else (change + 1) / 2
-        return (derained if self.training else derained.clamp(0, 1)), gate
+        return (derained if self.training else derained.clamp(0, 1)), opened
 
     def _pixels(self, features: Tensor) -> Tensor:
         return pixel_shuffle(features, self.config.patch) if self.config.patch > 1 else features
