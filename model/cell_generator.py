@@ -101,36 +101,46 @@ class CellGenerator:
             conv = cast(nn.Conv2d, step[1])
             drawn = functional.conv2d(windows, conv.weight, conv.bias)[:, :, 1:-1, 1:-1]
             return _after(step, drawn, 2)
+        if isinstance(first, nn.ConvTranspose2d):
+            return _after(step, self._raised(first, features, places))
         drawn = self._layer(first, features, places)
         return _after(step, functional.pixel_shuffle(drawn, 2) if isinstance(step[1], nn.PixelShuffle) else drawn,
                       2 if isinstance(step[1], nn.PixelShuffle) else 1)  # fmt: skip
 
     def _layer(self, layer: nn.Module, features: Tensor, places: _Places) -> Tensor:
         """A convolution of the cells' features, (N, C, k, k), in which neighbours see each other."""
-        if isinstance(layer, nn.ConvTranspose2d):  # 3 x 3, stride 2: its last row looks at the next place
-            before, after, run = 0, 1, _transposed(layer)
-        else:
-            conv = cast(nn.Conv2d, layer)
-            before = conv.kernel_size[0] // 2
-            after, run = before if conv.stride[0] == 1 else 0, _valid(conv)
+        conv = cast(nn.Conv2d, layer)
+        before = conv.kernel_size[0] // 2
+        after, run = before if conv.stride[0] == 1 else 0, _valid(conv)
         windows = places.windows(features, before, after) if before or after else features
         side = windows.shape[2]
-        if side > AS_MATRIX or getattr(layer, "groups", 1) > 1:
+        if side > AS_MATRIX or conv.groups > 1:
             return run(windows)
-        matrix, bias = self._matrix(layer, run, windows)
+        matrix, bias = self._matrix(conv, run, side, windows)
         flat = windows.permute(0, 2, 3, 1).reshape(len(windows), -1)
         drawn = functional.linear(flat, matrix, bias)
-        out = int((len(matrix) // cast(nn.Conv2d, layer).out_channels) ** 0.5)
+        out = int((len(matrix) // conv.out_channels) ** 0.5)
         return drawn.view(len(windows), out, out, -1).permute(0, 3, 1, 2)
 
-    def _matrix(self, layer: nn.Module, run: Callable[[Tensor], Tensor], like: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What a layer does to one window of this size, as a matrix: its answers to unit vectors."""
+    def _raised(self, layer: nn.ConvTranspose2d, features: Tensor, places: _Places) -> Tensor:
+        """A 3 x 3 transposed convolution of stride 2: 2 x 2 places beside each other make the 2 x 2 of the first."""
+        count, channels, size = features.shape[:3]
+        matrix, bias = self._matrix(layer, _transposed(layer), 2, features)
+        wide = places.windows(features, 0, 1).permute(0, 2, 3, 1)
+        four = [wide[:, i : i + size, j : j + size] for i in (0, 1) for j in (0, 1)]
+        drawn = functional.linear(torch.cat(four, 3).view(-1, 4 * channels), matrix, bias)
+        tiled = drawn.view(count, size, size, 2, 2, -1).transpose(2, 3)
+        return tiled.reshape(count, 2 * size, 2 * size, -1).permute(0, 3, 1, 2)
+
+    def _matrix(
+        self, layer: nn.Conv2d | nn.ConvTranspose2d, run: Callable[[Tensor], Tensor], side: int, like: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """What a layer does to a window of side x side places, as a matrix: its answers to unit vectors."""
         found = self._matrices.get(id(layer))
         if found is None:
-            _, channels, rows, columns = like.shape
-            unit = torch.eye(rows * columns * channels, device=like.device, dtype=like.dtype)
-            bias = cast(nn.Conv2d, layer).bias
-            answers = run(unit.view(-1, rows, columns, channels).permute(0, 3, 1, 2))
+            unit = torch.eye(side * side * like.shape[1], device=like.device, dtype=like.dtype)
+            bias = layer.bias
+            answers = run(unit.view(len(unit), side, side, -1).permute(0, 3, 1, 2))
             if bias is not None:
                 answers = answers - bias[:, None, None]
             places = answers.shape[2] * answers.shape[3]
