@@ -18,7 +18,6 @@ from rainstereo.model.architecture import PUBLISHED
 from rainstereo.model.discriminator import DiscriminatorConfig
 from rainstereo.model.losses import LossWeights
 
-
 SHIPPED = "shipped"
 """As a path of weights: those in the package."""
 
@@ -159,8 +158,8 @@ class Recipe:
 
     architecture, network: the generator's name in `architecture` and its options. losses: lambdas, see `losses`; the
     discriminator is trained only where they need it. start: weights that the generator starts from, a checkpoint or
-    "shipped", whose network it then is unless `network` says so itself; empty: random ones. vgg: file of VGG-19 weights for the perceptual loss; without it
-    features are random, and labelled so. name, notes: for the card.
+    "shipped", whose network it then is unless `network` says so itself; empty: random ones. vgg: file of VGG-19 weights
+    for the perceptual loss; without it features are random, and labelled so. name, notes: for the card.
     """
 
     seed: int = 0

@@ -332,7 +332,9 @@ def _started(recipe: Recipe) -> checkpoint.Checkpoint | None:
     theirs, ours = dataclasses.asdict(found.config), dataclasses.asdict(configure(recipe.architecture, recipe.network))
     other = [f"{key} = {theirs[key]!r}, not {ours[key]!r}" for key in theirs if theirs[key] != ours[key]]
     if other:
-        raise ValueError(f"start: the network of {path} has {', '.join(other)}; leave [network] out to take it as it is")
+        raise ValueError(
+            f"start: the network of {path} has {', '.join(other)}; leave [network] out to take it as it is"
+        )
     return found
 
 

@@ -12,8 +12,8 @@ class Candidate:
     """A pair of files, and what is known of the moment. wet None: the partner is missing.
 
     timestamp_us: None where unknown; `time` then comes from the frame's number. time: seconds, comparable within a
-    drive. regime: of the pump, "" unknown. sync_us: from one camera's exposure to the other's, NaN unknown. photometric: how
-    the wet image's gray levels were mapped (`Photometric.text`), "" not.
+    drive. regime: of the pump, "" unknown. sync_us: from one camera's exposure to the other's, NaN unknown.
+    photometric: how the wet image's gray levels were mapped (`Photometric.text`), "" not.
     """
 
     name: str
