@@ -292,7 +292,7 @@ def _by_name(recipe: dict[str, Any]) -> dict[str, Any]:
             {**s, "folder": short(s["folder"]), "clear": short(s["clear"]), "rainy": [short(p) for p in s["rainy"]]}
             for s in data[split]
         ]
-    return {**recipe, "data": data, "vgg": Path(recipe["vgg"]).name}
+    return {**recipe, "data": data, "start": short(recipe["start"]), "vgg": Path(recipe["vgg"]).name}
 
 
 def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
