@@ -33,7 +33,7 @@ class Options:
     """A rig folder, a file of any of the formats (its content says which), or the two files of a rig: ROS's, mrcal's,
     or OpenCV's intrinsics and extrinsics. A folder with dry.yaml and wet.yaml, or left.yaml and right.yaml, will do."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """What to write: a rig folder; a .yaml, .yml, .xml or .json file; a folder for ROS's two files; NAME.cameramodel."""
+    """What to write: a rig folder; a .yaml, .xml or .json file; a folder for ROS's two files; NAME.cameramodel."""
     format: Literal["auto", "rig", "opencv", "ros", "kalibr"] = "auto"
     """Format to write. auto: a rig folder (a .cameramodel for a single camera), or opencv where IN is one."""
     first: Literal["auto", "dry", "wet"] = "auto"
@@ -82,7 +82,7 @@ def run(options: Options) -> int:
     if refused:  # beside, not inside: a folder of that name may hold an earlier result
         record.write(options.out.with_name(f"{options.out.stem}.report.json"))
         print(
-            f"refused: more than {options.tolerance_px:g} px (--tolerance-px) is lost; to write it nevertheless: --allow-loss"
+            f"refused: that is more than --tolerance-px {options.tolerance_px:g}; to write nevertheless: --allow-loss"
         )
         return FAILED
     files = _write(options.out, content, written.files if written else {})

@@ -50,7 +50,7 @@ def yaml_of(text: str, path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in table.items()}
 
 
-class _Plain(yaml.SafeLoader):
+class _Plain(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML is untyped
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             raise ValueError("it repeats a part by an alias (*), which calibrations do not; write that part out")
@@ -70,7 +70,7 @@ def row(values: Iterable[float]) -> str:
 
 def word(text: str) -> str:
     """A text as YAML reads it, on one line."""
-    return yaml.safe_dump(text, width=MAX_BYTES).splitlines()[0]
+    return str(yaml.safe_dump(text, width=MAX_BYTES)).splitlines()[0]
 
 
 def opencv_of(text: str, path: Path) -> dict[str, Any]:

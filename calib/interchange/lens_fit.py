@@ -59,7 +59,8 @@ def to_camera(described: Described, tolerance_px: float) -> tuple[Camera, Loss |
         try:
             from rainstereo.calib.interchange import splined_fit
 
-            camera = splined_fit.fit(rays, pixels, described.size)
+            many = grid(described.size, 2 * ACROSS)
+            camera = splined_fit.fit(described.unproject(many), many, described.size)
         except ImportError:
             return fitted, loss
         better = measured(described, camera, camera.model)
@@ -100,7 +101,7 @@ def grid(size: tuple[int, int], across: int) -> Array:
 
 def measured(true: Camera | Described, fitted: Camera | Described, name: str) -> Loss:
     """How far apart two lenses see the rays of pixels all over the image of the first."""
-    pixels = grid(true.size, 2 * ACROSS)
+    pixels = grid(true.size, 2 * ACROSS + 7)  # not the points that were fitted
     rays = true.unproject(pixels)
     known = np.isfinite(rays).all(-1)
     off = np.hypot(*(fitted.project(rays[known]) - pixels[known]).T)

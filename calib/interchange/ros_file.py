@@ -40,8 +40,8 @@ def read(tables: list[tuple[entries.Table, str]]) -> DescribedSet:
         if np.allclose(t1, t2, atol=1e-12):
             raise ValueError(
                 f"{tables[0][1]} and {tables[1][1]} have the same last column of projection_matrix, so that the "
-                "cameras would stand in one place; expected the files of a stereo calibration, in which that of the second "
-                "camera is -fx * baseline"
+                "cameras would stand in one place; expected the files of a stereo calibration, in which that of "
+                "the second camera is -fx * baseline"
             )
         rt = np.concatenate([pose.rotation_vector(R2.T @ R1), R2.T @ (t2 - t1)])
     return DescribedSet(NAME, cameras, rt)

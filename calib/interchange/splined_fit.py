@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 
 from rainstereo.calib import mrcal_versions
 from rainstereo.camera import Camera
 from rainstereo.types import Array
 
-COLUMNS = 22
-MARGIN = 1.02
+COLUMNS = 18
+MARGIN = 1.04
 MAX_FOV_DEG = 300
 PASSES = 5
-STIFFNESS = 1e-4
+STIFFNESS = 1e-5
 """Weight of each knot's value, against pixels: holds those that no ray of the image reaches."""
 
 
@@ -37,8 +38,8 @@ def fit(rays: Array, pixels: Array, size: tuple[int, int]) -> Camera:
         found, _, by_lens = mrcal_versions.project_gradients(rays, model, state)
         J, off = by_lens[..., 4:].reshape(2 * len(rays), -1), (found - seen).ravel()
         knots = state[4:]
-        hold = STIFFNESS * np.eye(len(knots)) * np.mean(state[:2])
-        step = np.linalg.lstsq(np.vstack([J, hold]), -np.concatenate([off, hold @ knots]), rcond=None)[0]
+        hold = (STIFFNESS * np.mean(state[:2])) ** 2
+        step = scipy.linalg.solve(J.T @ J + hold * np.eye(len(knots)), -(J.T @ off + hold * knots), assume_a="pos")
         state[4:] += step
         if np.abs(J @ step).max() < 1e-6:
             break
