@@ -1,0 +1,142 @@
+"""One camera from points whose positions are known, through a window that stands still in their frame, or without.
+
+The window may lead into another medium, such as a tank's wall into water: points then lie inside the last layer, and what
+the camera sees depends on how far it stands from the wall (`refraction`). The reference frame is that of the points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+
+from rainstereo import refraction
+from rainstereo.calib.mrcal_versions import SolveError
+from rainstereo.camera import Camera
+from rainstereo.chamber import Chamber, Panel
+from rainstereo.pose import invert, rotation_matrix, transform
+from rainstereo.types import Array
+
+FAR_OFF = 1e4
+"""Residual in pixels of a point that a trial state does not see."""
+SMALLEST_FOCAL = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Plane-parallel layers in the points' frame: a point on the face towards the camera, (3,) metres, and the normal.
+
+    normal: from the camera to the points. A last panel without end is the medium in which the points lie.
+    """
+
+    face: Array
+    normal: Array
+    panels: tuple[Panel, ...]
+    gaps: tuple[float, ...] = ()
+
+    def seen_by(self, rt_cam_ref: Array) -> Chamber:
+        """The layers in a camera's frame. ValueError if the camera does not stand before them."""
+        n = np.asarray(self.normal, np.float64) / np.linalg.norm(self.normal)
+        distance = float(n @ (np.asarray(self.face) - invert(rt_cam_ref)[3:]))
+        turned = rotation_matrix(np.asarray(rt_cam_ref)[:3]) @ n
+        return Chamber(tuple(turned.tolist()), distance, self.panels, self.gaps)
+
+
+@dataclass(frozen=True)
+class Free:
+    """What is fitted besides the pose: one focal length, the principal point, and how many radial coefficients."""
+
+    focal: bool = True
+    centre: bool = False
+    radial: int = 1
+
+
+def seen(points: Array, camera: Camera, window: Window | None = None) -> Array:
+    """Pixels, (N, 2), at which the camera, in its pose, sees points, (N, 3), of the reference frame; NaN where not."""
+    inside = None if window is None else window.seen_by(camera.rt_cam_ref)
+    return refraction.project(transform(camera.rt_cam_ref, points), camera, inside)[0]
+
+
+def fit(
+    points: Array, pixels: Array, start: Camera, window: Window | None = None, free: Free | None = None,
+    robust_px: float = 0.0,
+) -> Camera:  # fmt: skip
+    """The camera, with its pose, that sees points, (N, 3) metres, at pixels, (N, 2): least squares.
+
+    start: where the iteration begins; also gives image size and what is not free. Its model becomes LENSMODEL_OPENCV4, fx = fy.
+    robust_px: residuals beyond this count less (0: they do not). SolveError if the iteration ends nowhere.
+    """
+    free = Free() if free is None else free
+    points, pixels = np.asarray(points, np.float64), np.asarray(pixels, np.float64)
+    count = 6 + free.focal + 2 * free.centre + free.radial
+    if points.shape != (len(pixels), 3) or pixels.shape != (len(points), 2) or 2 * len(points) < count:
+        raise ValueError(
+            f"points have shape {points.shape} and pixels {pixels.shape}; expected (N, 3) and (N, 2) with N at least "
+            f"{-(-count // 2)} for {count} unknowns"
+        )
+    if not 0 <= free.radial <= 2:
+        raise ValueError(f"{free.radial} radial coefficients were asked for; expected 0, 1 or 2")
+
+    def off(state: Array) -> Array:
+        camera = _camera(state, start, free)
+        if camera is None:
+            return np.full(2 * len(points), FAR_OFF)
+        try:
+            found = seen(points, camera, window)
+        except ValueError:  # a step too far put the camera behind the window
+            return np.full(2 * len(points), FAR_OFF)
+        return np.nan_to_num(found - pixels, nan=FAR_OFF).ravel()
+
+    first = _state(start, free)
+    loss = {"loss": "soft_l1", "f_scale": robust_px} if robust_px else {"method": "lm"}
+    done = scipy.optimize.least_squares(off, first, x_scale=_scale(start, free), xtol=1e-11, ftol=1e-11, **loss)
+    camera = _camera(done.x, start, free)
+    if camera is None or not np.abs(done.fun).max() < FAR_OFF:
+        raise SolveError(
+            f"no camera was found that sees these {len(points)} points there; check which pixel belongs to which point, "
+            "the start and the window"
+        )
+    return camera
+
+
+def triangulate(pixels: list[Array], cameras: list[Camera], windows: list[Window | None], start: Array) -> Array:
+    """The point, (3,), of the reference frame that cameras see at pixels, (2,) each: least squares in pixels."""
+
+    def off(point: Array) -> Array:
+        found = [seen(point[None], c, w)[0] for c, w in zip(cameras, windows, strict=True)]
+        return np.nan_to_num(np.stack(found) - np.stack(pixels), nan=FAR_OFF).ravel()
+
+    return np.asarray(scipy.optimize.least_squares(off, np.asarray(start, np.float64), x_scale=0.01, method="lm").x)
+
+
+def _state(camera: Camera, free: Free) -> Array:
+    k = np.zeros(2)
+    given = camera.distortion[:2]
+    k[: len(given)] = given
+    parts = [camera.rt_cam_ref, [camera.intrinsics[:2].mean()] if free.focal else []]
+    parts += [camera.intrinsics[2:4] if free.centre else [], k[: free.radial]]
+    return np.concatenate(parts)
+
+
+def _scale(camera: Camera, free: Free) -> Array:
+    """How far each unknown goes to move a pixel by a few: rotation, shift, focal length, centre, radial terms."""
+    f = float(camera.intrinsics[0])
+    depth = max(float(np.linalg.norm(camera.rt_cam_ref[3:])), 0.05)
+    wide = f / max(camera.size) * 2
+    parts = [[1 / f] * 3, [depth / f] * 3, [wide] * free.focal, [1.0] * (2 * free.centre)]
+    return np.concatenate([*map(np.asarray, parts), np.array([wide**3 / f, wide**5 / f])[: free.radial]]).astype(np.float64)
+
+
+def _camera(state: Array, start: Camera, free: Free) -> Camera | None:
+    """The camera of a state; None where there is none."""
+    if not np.isfinite(state).all():
+        return None
+    rest = list(state[6:])
+    f = rest.pop(0) if free.focal else float(start.intrinsics[:2].mean())
+    centre = [rest.pop(0), rest.pop(0)] if free.centre else list(start.intrinsics[2:4])
+    k = np.zeros(4)
+    k[: len(rest)] = rest
+    if f < SMALLEST_FOCAL:
+        return None
+    return Camera("LENSMODEL_OPENCV4", np.array([f, f, *centre, *k]), start.width, start.height, state[:6])
