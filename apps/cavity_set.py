@@ -1,8 +1,8 @@
 """The cavity set of OpenPTV's: four cameras look at a dot target through 6 mm of plexiglass into water.
 
-A folder holds cam1.png to cam4.png, the target's dots in target_on_a_side.txt (number, x, y, z in mm), and OpenPTV's own
-calibration of each camera, camN.tif.ori and camN.tif.addpar. The target is lit from the side; dust, glue and the edges of its
-plates are in the way, cameras 1 and 2 look from one side, 3 and 4 from the other.
+A folder holds cam1.png to cam4.png, the target's dots in target_on_a_side.txt (number, x, y, z in mm), and OpenPTV's
+own calibration of each camera, camN.tif.ori. The target is lit from the side; dust, glue and the edges of its plates
+are in the way; cameras 1 and 2 look from one side, 3 and 4 from the other.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class View:
 
 
 def load(folder: Path) -> tuple[View, ...]:
-    """The four views, their dots found and numbered. ValueError or FileNotFoundError where a file is not as expected."""
+    """The four views, their dots found and numbered. ValueError or FileNotFoundError: a file is not as expected."""
     ids, points = target(folder / "target_on_a_side.txt")
     return tuple(_view(folder, number, ids, points) for number in NUMBERS)
 
@@ -74,7 +74,9 @@ def orientation(path: Path) -> tuple[Camera, Window]:
 def _view(folder: Path, number: int, ids: Indices, points: Array) -> View:
     image = imagefile.read(folder / f"cam{number}.png", gray=True)
     if image.shape != SIZE[::-1]:
-        raise ValueError(f"cam{number}.png is {image.shape[1]} x {image.shape[0]}; expected {SIZE[0]} x {SIZE[1]} pixels")
+        raise ValueError(
+            f"cam{number}.png is {image.shape[1]} x {image.shape[0]}; expected {SIZE[0]} x {SIZE[1]} pixels"
+        )
     camera, window = orientation(folder / f"cam{number}.tif.ori")
     found = dots.find(image).centres
     which, pixels = _numbered(points, found, camera, window)

@@ -1,4 +1,4 @@
-"""What each model of the cavity set's cameras is worth: on the dots it was fitted to, on dots it was not, and in space."""
+"""What a model of the cavity set's cameras is worth: on dots it was fitted to, on others, and in space."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Trial:
         return tuple(found)
 
     def in_space(self, numbers: Sequence[int] = NUMBERS) -> Array:
-        """Errors, (N, 3) metres, of dots triangulated by these cameras, each fitted to the other half of the columns."""
+        """Errors, (N, 3) metres, of dots triangulated by these cameras, fitted to the other columns."""
         found = []
         for parity, cameras in self._by_half:
             chosen = [(v, c) for v, c in zip(self.views, cameras, strict=True) if v.number in numbers]

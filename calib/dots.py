@@ -1,4 +1,4 @@
-"""Centres of bright round dots of a known size: beads or holes of a target, lit from the side, among dust and scratches.
+"""Centres of bright round dots of known size: beads or holes of a target, lit from the side, among dust and scratches.
 
 A disc is correlated with the image at several radii; specks, lines and edges look little like it. The centre is
 that of the dot's light above its surroundings, capped, so that a highlight on one side counts for less.
@@ -45,7 +45,9 @@ def find(image: Image, radii: Sequence[float] = (3.5, 4.5, 5.5), likeness: float
         raise ValueError(f"the image has shape {image.shape}; expected a gray one, (height, width)")
     half = int(np.ceil(2.5 * max(radii)))
     if min(image.shape) <= 2 * half + 1:
-        raise ValueError(f"an image of {image.shape[1]} x {image.shape[0]} pixels holds no dot of radius {max(radii):g}")
+        raise ValueError(
+            f"an image of {image.shape[1]} x {image.shape[0]} pixels holds no dot of radius {max(radii):g}"
+        )
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR)
     best, which = _correlation(smooth, radii)
     peaks = (best == cv2.dilate(best, np.ones((SEPARATION, SEPARATION)))) & (best > likeness)

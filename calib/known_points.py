@@ -1,7 +1,7 @@
 """One camera from points whose positions are known, through a window that stands still in their frame, or without.
 
-The window may lead into another medium, such as a tank's wall into water: points then lie inside the last layer, and what
-the camera sees depends on how far it stands from the wall (`refraction`). The reference frame is that of the points.
+The window may lead into another medium, such as a tank's wall into water: points then lie inside the last layer, and
+what the camera sees depends on how far it stands from the wall (`refraction`). The reference frame is the points' own.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def fit(
 ) -> Camera:  # fmt: skip
     """The camera, with its pose, that sees points, (N, 3) metres, at pixels, (N, 2): least squares.
 
-    start: where the iteration begins; also gives image size and what is not free. Its model becomes LENSMODEL_OPENCV4, fx = fy.
-    robust_px: residuals beyond this count less (0: they do not). SolveError if the iteration ends nowhere.
+    start: where the iteration begins; also gives image size and what is not free. The camera found is LENSMODEL_OPENCV4
+    with fx = fy. robust_px: residuals beyond this count less (0: they do not). SolveError if that ends nowhere.
     """
     free = Free() if free is None else free
     points, pixels = np.asarray(points, np.float64), np.asarray(pixels, np.float64)
@@ -94,8 +94,8 @@ def fit(
     camera = _camera(done.x, start, free)
     if camera is None or not np.abs(done.fun).max() < FAR_OFF:
         raise SolveError(
-            f"no camera was found that sees these {len(points)} points there; check which pixel belongs to which point, "
-            "the start and the window"
+            f"no camera was found that sees these {len(points)} points there; check which pixel belongs to which "
+            "point, the start and the window"
         )
     return camera
 
@@ -124,8 +124,9 @@ def _scale(camera: Camera, free: Free) -> Array:
     f = float(camera.intrinsics[0])
     depth = max(float(np.linalg.norm(camera.rt_cam_ref[3:])), 0.05)
     wide = f / max(camera.size) * 2
-    parts = [[1 / f] * 3, [depth / f] * 3, [wide] * free.focal, [1.0] * (2 * free.centre)]
-    return np.concatenate([*map(np.asarray, parts), np.array([wide**3 / f, wide**5 / f])[: free.radial]]).astype(np.float64)
+    pose = [1 / f] * 3 + [depth / f] * 3
+    lens = [wide] * free.focal + [1.0] * (2 * free.centre) + [wide**3 / f, wide**5 / f][: free.radial]
+    return np.array(pose + lens)
 
 
 def _camera(state: Array, start: Camera, free: Free) -> Camera | None:

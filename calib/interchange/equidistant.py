@@ -1,7 +1,8 @@
 """The equidistant lens of Kalibr, ROS and cv2.fisheye, for a ray at the angle t to the axis.
 
 r = f (t + k1 t^3 + k2 t^5 + k3 t^7 + k4 t^9): J. Kannala, S. S. Brandt, "A generic camera model and calibration
-method for conventional, wide-angle, and fish-eye lenses", PAMI 2006, equation 6, with k1 = 1. Points behind the image plane have images, too.
+method for conventional, wide-angle, and fish-eye lenses", PAMI 2006, equation 6, with k1 = 1. Points behind the image
+plane have images, too.
 """
 
 from __future__ import annotations

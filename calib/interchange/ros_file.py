@@ -1,8 +1,8 @@
 """ROS: a camera_info YAML for each camera, as `camera_calibration` writes it and `camera_info_manager` reads it.
 
-The two cameras' pose stands in `rectification_matrix` (R) and `projection_matrix` (P): with X_rect = R X, camera i
-sees K' X_rect + P[:, 3], K' = P[:, :3]. So X_second = R2' (R1 X_first + K2'^-1 P2[:, 3] - K1'^-1 P1[:, 3]); for a
-horizontal pair whose first camera stands left, P2[0, 3] = -fx' baseline (sensor_msgs/CameraInfo).
+The two cameras' pose stands in `rectification_matrix` (R) and `projection_matrix` (P): camera i sees a point X of the
+rectified frame that both share at P (X, 1), so that it stands at R_i' (X + K'^-1 P_i[:, 3]) before it, K' = P_i[:, :3].
+For a horizontal pair whose first camera stands left, P2[0, 3] = -fx' baseline (sensor_msgs/CameraInfo).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _camera(table: entries.Table, where: str) -> Described:
 
 
 def _rectified(table: entries.Table, where: str) -> tuple[Array, Array]:
-    """R, and where points stand from the rectified camera: X = R X_cam + t."""
+    """R and t of R X_camera = X_shared + t."""
     R, P = (entries.need(table, f"{key}_matrix", where) for key in ("rectification", "projection"))
     P = entries.matrix(P, 3, 4, f"projection_matrix of {where}")
     entries.core(P[:, :3].tolist(), f"the left 3 x 3 of projection_matrix of {where}")
