@@ -33,21 +33,16 @@ class OpenCVModel(Model):
         fx, fy, cx, cy = view.openptv.intrinsics[:4]
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST
-        flags |= cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | (0 if self.free.centre else cv2.CALIB_FIX_PRINCIPAL_POINT)
-        # OpenCV gives up where the centre leaves the image, as it does here, unless its image is said to be larger
-        size = (16 * view.openptv.width, 16 * view.openptv.height) if self.free.centre else view.openptv.size
+        flags |= cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_PRINCIPAL_POINT
         points, pixels = view.points[use].astype(np.float32), view.pixels[use].astype(np.float32)
-        _, K, k, r, t = cv2.calibrateCamera([points], [pixels], size, K, np.zeros(5), flags=flags)
+        _, K, k, r, t = cv2.calibrateCamera([points], [pixels], view.openptv.size, K, np.zeros(5), flags=flags)
         intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(k)[:4]])
         return Camera(
             "LENSMODEL_OPENCV4", intrinsics, *view.openptv.size, np.concatenate([np.ravel(r[0]), np.ravel(t[0])])
         )
 
 
-PEERS = (
-    OpenCVModel("central, cv2.calibrateCamera", False, Free(), "the same unknowns"),
-    OpenCVModel("the same, centre free", False, Free(centre=True), "principal point, too"),
-)
+PEER_MODEL = OpenCVModel("central, cv2.calibrateCamera", False, Free(), "takes no pose to start from")
 
 
 def build(seed: int, quick: bool, folder: Path | None = None) -> Stage:
@@ -57,8 +52,7 @@ def build(seed: int, quick: bool, folder: Path | None = None) -> Stage:
             "stage cavity needs images: give --cavity FOLDER, with OpenPTV's cavity set (docs/interchange.md)"
         )
     views = cavity_set.load(folder)
-    ours = tuple(model for model in MODELS if model.refraction)
-    models = (ours[0], PEERS[0]) if quick else (*ours, *PEERS)
+    models = MODELS[:2] if quick else (*MODELS, PEER_MODEL)
     trials = [Trial(model, views) for model in models]
     count = sum(len(view.ids) for view in views)
     work = Work(
@@ -92,10 +86,12 @@ def build(seed: int, quick: bool, folder: Path | None = None) -> Stage:
             "The target limits all of them: residuals from opposite sides correlate by 0.3 to 0.5.",
             "A principal point that may go anywhere lets a central camera imitate much of the refraction on the dots "
             "it was fitted to; then it lies outside of the image, and depth stays wrong.",
+            "cv2.calibrateCamera finds the same central cameras (to 0.001 px), but for one half of camera 1's dots, for "
+            "which it ends behind the target: no error is given.",
             "Detection is not part of the time.",
         ),
         (Picture("residuals", f"Residuals of both models, {MAGNIFY} times longer, on the dots they were fitted to.",
-                 lambda: residual_pictures(Trial(ours[0], views), Trial(PEERS[0], views))),),
+                 lambda: residual_pictures(Trial(MODELS[0], views), Trial(MODELS[1], views))),),
     )  # fmt: skip
 
 

@@ -60,7 +60,7 @@ def run(options: Options) -> int:
         options.sources, first=first, size=_size(options.size), metres=UNITS[options.unit],
         tolerance_px=options.tolerance_px,
     )  # fmt: skip
-    ours = read.format in ("rig", "cameramodel")
+    ours = read.format == "rig" or (read.format == "cameramodel" and isinstance(read.content, Camera))
     wanted = options.format if options.format != "auto" else "opencv" if ours else "rig"
     content = read.content if options.chamber is None else _behind(options.chamber, read.content)
     record["from"], record["to"], record["notes"] = read.format, wanted, [n for n in read.notes if n]

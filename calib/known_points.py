@@ -13,6 +13,7 @@ import scipy.optimize
 
 from rainstereo import refraction
 from rainstereo.calib.mrcal_versions import SolveError
+from rainstereo.calib.rotation import rotated_by
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber, Panel
 from rainstereo.pose import invert, rotation_matrix, transform
@@ -88,9 +89,18 @@ def fit(
             return np.full(2 * len(points), FAR_OFF)
         return np.nan_to_num(found - pixels, nan=FAR_OFF).ravel()
 
+    def slope(state: Array) -> Array:
+        camera = _camera(state, start, free)
+        try:
+            J = np.zeros((len(points), 2, count)) if camera is None else derivatives(points, camera, window, free)
+        except ValueError:
+            J = np.zeros((len(points), 2, count))
+        return np.nan_to_num(J, nan=0.0).reshape(-1, count)
+
     first = _state(start, free)
     loss = {"loss": "soft_l1", "f_scale": robust_px} if robust_px else {"method": "lm"}
-    done = scipy.optimize.least_squares(off, first, x_scale=_scale(start, free), xtol=1e-11, ftol=1e-11, **loss)
+    scale = _scale(start, free)
+    done = scipy.optimize.least_squares(off, first, slope, x_scale=scale, xtol=1e-11, ftol=1e-11, **loss)
     camera = _camera(done.x, start, free)
     if camera is None or not np.abs(done.fun).max() < FAR_OFF:
         raise SolveError(
@@ -98,6 +108,36 @@ def fit(
             "point, the start and the window"
         )
     return camera
+
+
+def derivatives(points: Array, camera: Camera, window: Window | None, free: Free) -> Array:
+    """Of the pixels of points, (N, 2, unknowns): by the pose (3 of rotation, 3 of translation), then by what is free.
+
+    As the camera moves, so do the window's normal and distance in its frame.
+    """
+    rt, f = camera.rt_cam_ref, float(camera.intrinsics[0])
+    P = transform(rt, points)
+    turned = rotated_by(rt[:3], points)
+    if window is None:
+        pixels, by_point = camera.project_jacobian(P)
+        parts, apparent = [by_point @ turned, by_point], P
+    else:
+        chamber = window.seen_by(rt)
+        normal = np.asarray(window.normal, np.float64) / np.linalg.norm(window.normal)
+        tilted = rotated_by(rt[:3], normal[None])[0]
+        J = refraction.jacobian(P, camera, chamber)
+        by_distance = J.distance[..., None]
+        around = J.point @ turned + J.normal @ tilted + by_distance * (rt[3:] @ tilted)
+        parts = [around, J.point + by_distance * np.asarray(chamber.normal)]
+        pixels, apparent = J.pixels, refraction.apparent(P, chamber)[0]
+    if free.focal:
+        parts.append(((pixels - camera.intrinsics[2:4]) / f)[..., None])
+    if free.centre:
+        parts.append(np.tile(np.eye(2), (len(P), 1, 1)))
+    plane = apparent[:, :2] / apparent[:, 2:]
+    squared = (plane**2).sum(-1, keepdims=True)
+    parts += [(f * plane * squared ** (power + 1))[..., None] for power in range(free.radial)]
+    return np.concatenate(parts, -1)
 
 
 def triangulate(pixels: list[Array], cameras: list[Camera], windows: list[Window | None], start: Array) -> Array:

@@ -15,7 +15,6 @@ from rainstereo.calib.interchange import bounded, source, target
 from rainstereo.pose import compose, invert, rotation_matrix, transform
 from rainstereo.rig import ROLES
 from rainstereo.types import Array
-
 from tests.calib import synthetic
 
 FORMATS = {"opencv": ("rig.yml", "rig.xml", "rig.json"), "ros": ("rig",), "kalibr": ("rig.yaml",)}
@@ -230,8 +229,9 @@ HOSTILE = {
     "no camera": ("%YAML:1.0\n---\nK3: 1\n", "describes no camera: it has K3"),
     "damaged": ("%YAML:1.0\n---\nK1: !!opencv-matrix\n  rows: [\n", "is no FileStorage file"),
     "a matrix of 10^12": (
-        "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 1000000\n   cols: 1000000\n   dt: d\n   data: [ 1. ]\n"
-        "distortion_coefficients: [0]\nimage_width: 9\nimage_height: 9\n", "has 1000000 rows and 1000000 columns",
+        "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 1000000\n   cols: 1000000\n   dt: d\n"
+        "   data: [ 1. ]\ndistortion_coefficients: [0]\nimage_width: 9\nimage_height: 9\n",
+        "has 1000000 rows and 1000000 columns",
     ),
     "other": ("foo: 1\nbar: 2\n", "no format that is known here; it has foo, bar"),
     "three cameras": ("cam0: {}\ncam1: {}\ncam2: {}\n", "expected cam0, or cam0 and cam1"),
