@@ -177,6 +177,8 @@ def _camera(state: Array, start: Camera, free: Free) -> Camera | None:
     f = rest.pop(0) if free.focal else float(start.intrinsics[:2].mean())
     centre = [rest.pop(0), rest.pop(0)] if free.centre else list(start.intrinsics[2:4])
     k = np.zeros(4)
+    given = start.distortion[:4]
+    k[: len(given)] = given
     k[: len(rest)] = rest
     if f < SMALLEST_FOCAL:
         return None
