@@ -114,4 +114,4 @@ def rms(residuals: Array | Sequence[Array]) -> float:
 
 
 def _columns(view: View) -> Array:
-    return np.round(view.points[:, 0] * 1000 / COLUMN_MM) % 2
+    return np.asarray(np.round(view.points[:, 0] * 1000 / COLUMN_MM) % 2)

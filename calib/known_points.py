@@ -145,7 +145,7 @@ def triangulate(pixels: list[Array], cameras: list[Camera], windows: list[Window
 
     def off(point: Array) -> Array:
         found = [seen(point[None], c, w)[0] for c, w in zip(cameras, windows, strict=True)]
-        return np.nan_to_num(np.stack(found) - np.stack(pixels), nan=FAR_OFF).ravel()
+        return np.asarray(np.nan_to_num(np.stack(found) - np.stack(pixels), nan=FAR_OFF).ravel())
 
     return np.asarray(scipy.optimize.least_squares(off, np.asarray(start, np.float64), x_scale=0.01, method="lm").x)
 
@@ -154,9 +154,9 @@ def _state(camera: Camera, free: Free) -> Array:
     k = np.zeros(2)
     given = camera.distortion[:2]
     k[: len(given)] = given
-    parts = [camera.rt_cam_ref, [camera.intrinsics[:2].mean()] if free.focal else []]
-    parts += [camera.intrinsics[2:4] if free.centre else [], k[: free.radial]]
-    return np.concatenate(parts)
+    focal = [camera.intrinsics[:2].mean()] if free.focal else []
+    centre = camera.intrinsics[2:4].tolist() if free.centre else []
+    return np.array([*camera.rt_cam_ref, *focal, *centre, *k[: free.radial]])
 
 
 def _scale(camera: Camera, free: Free) -> Array:

@@ -96,7 +96,7 @@ def grid(size: tuple[int, int], across: int) -> Array:
     """Pixels, (N, 2), all over an image, its edges among them."""
     step = max(size) / across
     x, y = (np.linspace(-0.5, side - 0.5, max(2, round(side / step) + 1)) for side in size)
-    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    return np.asarray(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
 
 
 def measured(true: Camera | Described, fitted: Camera | Described, name: str) -> Loss:
@@ -135,7 +135,8 @@ def _fit_opencv(rays: Array, pixels: Array, count: int, like: Described) -> Desc
 
     def off(state: Array) -> Array:
         u, v = lens.distort(a, b, state[4:])
-        return np.nan_to_num(np.stack([u * state[0] + state[2], v * state[1] + state[3]]) - seen.T, nan=1e9).ravel()
+        found = np.stack([u * state[0] + state[2], v * state[1] + state[3]])
+        return np.asarray(np.nan_to_num(found - seen.T, nan=1e9).ravel())
 
     state = like.core
     for n in sorted({min(count, n) for n in (4, 8, 12)}):  # a few coefficients first: the rational ones need a start
@@ -152,7 +153,8 @@ def _fit_equidistant(rays: Array, pixels: Array, like: Described) -> Described:
     directions, seen = rays[use], pixels[use]
 
     def off(state: Array) -> Array:
-        return np.nan_to_num(equidistant.project(directions, state[:4], state[4:]) - seen, nan=1e9).ravel()
+        found = equidistant.project(directions, state[:4], state[4:])
+        return np.asarray(np.nan_to_num(found - seen, nan=1e9).ravel())
 
     start = np.concatenate([like.core, np.zeros(4)])
     state = scipy.optimize.least_squares(off, start, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-15, max_nfev=3000).x

@@ -71,7 +71,7 @@ def _size(table: entries.Table, where: str, given: tuple[int, int] | None, index
             pair = entries.numbers(table[name], f"{name} of {where}")
             if len(pair) != 2:
                 raise ValueError(f"{name} of {where} holds {len(pair)} numbers; expected the width and the height")
-            return entries.size(*pair.tolist(), where)
+            return entries.size(float(pair[0]), float(pair[1]), where)
     for width, height in (("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height")):
         if width in table and height in table:
             return entries.size(table[width], table[height], where)

@@ -100,7 +100,7 @@ def _rectifications(described: DescribedSet) -> list[tuple[Array, Array]]:
         _matrix(first), first.distortion, _matrix(second), second.distortion, first.size,
         pose.rotation_matrix(rt[:3]), rt[3:].reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
     )  # fmt: skip
-    found = [(np.asarray(R1), np.asarray(P1)), (np.asarray(R2), np.asarray(P2))]
+    found = [(np.asarray(R, np.float64), np.asarray(P, np.float64)) for R, P in ((R1, P1), (R2, P2))]
     return found[::-1] if swapped else found
 
 

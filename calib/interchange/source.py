@@ -59,7 +59,7 @@ def read(
     if described.ignored:
         notes = (*notes, f"left behind, since a rig has no place for it: {', '.join(described.ignored)}")
     fitted = [lens_fit.to_camera(camera, tolerance_px) for camera in described.cameras]
-    losses = {role: loss for role, (_, loss) in zip(roles, fitted, strict=True) if loss is not None}
+    losses: dict[str, Loss] = {role: loss for role, (_, loss) in zip(roles, fitted, strict=True) if loss is not None}
     if described.rt_second_first is None:
         return Source(fitted[0][0], described.format, losses, notes[1:] if len(roles) == 1 else notes)
     rt = np.concatenate([described.rt_second_first[:3], described.rt_second_first[3:] * metres])
