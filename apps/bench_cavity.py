@@ -86,8 +86,8 @@ def build(seed: int, quick: bool, folder: Path | None = None) -> Stage:
             "The target limits all of them: residuals from opposite sides correlate by 0.3 to 0.5.",
             "A principal point that may go anywhere lets a central camera imitate much of the refraction on the dots "
             "it was fitted to; then it lies outside of the image, and depth stays wrong.",
-            "cv2.calibrateCamera finds the same central cameras (to 0.001 px), but for one half of camera 1's dots, "
-            "for which it ends behind the target: no error is given.",
+            "From all dots cv2.calibrateCamera finds the same central cameras; from one half of camera 1's it ends with the "
+            "camera behind the target, so that no error is given.",
             "Detection is not part of the time.",
         ),
         (Picture("residuals", f"Residuals of both models, {MAGNIFY} times longer, on the dots they were fitted to.",

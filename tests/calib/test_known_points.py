@@ -58,7 +58,7 @@ def test_pixels_are_those_of_openptv(target: Array) -> None:
     centre = np.array([0.081, 0.013, -0.570])
     pose = np.concatenate([cv2.Rodrigues(axes)[0].ravel(), -axes @ centre])
     ours = known_points.seen(target, Camera.pinhole(7000, 7000, 0, 0, 1280, 1024).with_pose(pose), straight)
-    np.testing.assert_allclose(ours, np.stack([mm[:, 0], -mm[:, 1]], -1) * 100, atol=0.02)
+    np.testing.assert_allclose(ours, np.stack([mm[:, 0], -mm[:, 1]], -1) * 100, atol=0.002)
 
 
 def _angles(R: Array) -> Array:
