@@ -21,6 +21,9 @@ from rainstereo.camera import Camera
 from rainstereo.types import Array, Mask
 
 MAGNIFY = 50
+CAPTION = (
+    f"Residuals of both models, {MAGNIFY} times longer, on the dots they were fitted to; the middle of each image."
+)
 
 
 @dataclass(frozen=True)
@@ -86,11 +89,11 @@ def build(seed: int, quick: bool, folder: Path | None = None) -> Stage:
             "The target limits all of them: residuals from opposite sides correlate by 0.3 to 0.5.",
             "A principal point that may go anywhere lets a central camera imitate much of the refraction on the dots "
             "it was fitted to; then it lies outside of the image, and depth stays wrong.",
-            "From all dots cv2.calibrateCamera finds the same central cameras; from one half of camera 1's it ends with the "
-            "camera behind the target, so that no error is given.",
+            "From all dots cv2.calibrateCamera finds the same central cameras; from one half of camera 1's it ends "
+            "with the camera behind the target, so that no error is given.",
             "Detection is not part of the time.",
         ),
-        (Picture("residuals", f"Residuals of both models, {MAGNIFY} times longer, on the dots they were fitted to.",
+        (Picture("residuals", CAPTION,
                  lambda: residual_pictures(Trial(MODELS[0], views), Trial(MODELS[1], views))),),
     )  # fmt: skip
 
@@ -118,7 +121,7 @@ def _as_filed(view: View) -> Array:
 @styled
 def residual_pictures(with_wall: Trial, without: Trial) -> Figure:
     """Residuals of two models as arrows: a row for each model, a column for each camera."""
-    figure, axes = sheet(11, 5.6, 2, len(with_wall.views))
+    figure, axes = sheet(11, 4.7, 2, len(with_wall.views))
     for row, (trial, colour) in enumerate(((with_wall, WET), (without, PEER))):
         for column, (view, residual) in enumerate(zip(trial.views, trial.residuals, strict=True)):
             axis = axes[row, column]
@@ -126,6 +129,7 @@ def residual_pictures(with_wall: Trial, without: Trial) -> Figure:
             axis.plot(*np.stack([view.pixels, ends], 1).T, color=colour, lw=1.0)
             axis.plot(*view.pixels.T, ".", ms=2.5, color=colour)
             image_axes(axis, view.openptv.size)
+            axis.set(xlim=(100, 1180), ylim=(1000, 220), xticks=[], yticks=[])
             axis.set(xlabel="", ylabel=trial.model.name.split(",")[0] if not column else "")
             axis.set_title(f"camera {view.number}: {rms(residual):.2f} px", fontsize=10, color=FAINT)
     return figure
