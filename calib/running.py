@@ -1,0 +1,355 @@
+"""A calibration that keeps up with a capture: each new frame joins the solution at hand instead of starting anew.
+
+A new frame gets its pose under the present lenses (`posing`), then everything is solved from there by the same steps
+that a whole calibration ends with (`solve.settle`), so that both have the same solution; outliers and poses that were
+turned the wrong way are looked for anew, from nothing, each time the frames have grown by half.
+
+Frames that would change nothing measurable stay outside: the board has not moved since another frame, or all frames
+left out together would lessen no uncertainty at infinity by more than a stated share s. As both solutions are the
+best for their frames, they then differ by less than sqrt(2 s) of a sigma (the variance of the difference is the
+difference of the variances: Hausman, "Specification tests in econometrics", 1978).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from rainstereo.calib import adjust, guidance, information, posing
+from rainstereo.calib import mrcal_versions as versions
+from rainstereo.calib.adjust import Adjustment
+from rainstereo.calib.board import Board
+from rainstereo.calib.guidance import Certainty
+from rainstereo.calib.mrcal_versions import Problem, SolveError
+from rainstereo.calib.observations import Observations
+from rainstereo.calib.seed import usable
+from rainstereo.calib.solve import Solution, package, settle, solve
+from rainstereo.chamber import Chamber
+from rainstereo.rig import ROLES
+from rainstereo.types import Array
+
+FEWEST = 3
+"""Pairs before a first solution is tried."""
+AFRESH = 1.5
+"""Growth of the frames after which all is solved from nothing."""
+REDUNDANT = 0.03
+SAME_PLACE_PX = 1.5
+MISFIT, MISFIT_PX = 6.0, 2.0
+"""A new frame that fits, with its own pose free, this many times worse than the others is not taken in."""
+
+Fate = Literal["used", "redundant", "rejected", "waiting"]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One pair's corners, (cameras, rows, columns, 2) pixels, NaN where unseen."""
+
+    name: str
+    corners: Array
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What became of a frame, and why. gain: the largest share by which it lessens, or would, a sigma at infinity."""
+
+    fate: Fate
+    reason: str = ""
+    gain: float = np.nan
+
+
+@dataclass
+class Spent:
+    """Seconds of the work so far, by kind, and how often each was done."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    count: dict[str, int] = field(default_factory=dict)
+
+    def add(self, kind: str, seconds: float) -> None:
+        """Note that much time for one piece of work."""
+        self.seconds[kind] = self.seconds.get(kind, 0.0) + seconds
+        self.count[kind] = self.count.get(kind, 0) + 1
+
+
+class Running:
+    """A calibration in progress. Not for several threads at once.
+
+    judged: what became of each frame, by name, in the order in which they came. solution, known: the present solution
+    and its certainty; None while there is none, and then `trouble` says why.
+    """
+
+    def __init__(
+        self,
+        board: Board,
+        sizes: tuple[tuple[int, int], tuple[int, int]],
+        lensmodel: str,
+        chamber: Chamber | None,
+        *,
+        redundant: float = REDUNDANT,
+    ) -> None:
+        if not 0 <= redundant < 1:
+            raise ValueError(f"frames that lessen no sigma by a share of {redundant} are redundant; expected 0 to 1")
+        versions.parameters(lensmodel)
+        self.board, self.sizes, self.lensmodel, self.chamber = board, sizes, lensmodel, chamber
+        self.redundant = redundant
+        self.views: dict[str, View] = {}
+        self.judged: dict[str, Judged] = {}
+        self.solution: Solution | None = None
+        self.known: Certainty | None = None
+        self.trouble = f"{FEWEST} pairs at least are needed"
+        self.spent = Spent()
+        self._adjustment: Adjustment | None = None
+        self._left_out: dict[str, Array] = {}  # name -> pose
+        self._solved_afresh = 0
+        self._unsolved = 0
+
+    # -- frames come and go ----------------------------------------------------------------------------------------
+
+    def add(self, view: View, *, solve_now: bool = True) -> Judged:
+        """Take in a pair. solve_now: False where more follow at once; the solution is then renewed only now and then.
+
+        A name that is known already is a ValueError.
+        """
+        if view.name in self.views:
+            raise ValueError(f"frame {view.name!r} is here already; remove it first")
+        if not all(usable(corners) for corners in view.corners):
+            self.judged[view.name] = Judged("rejected", adjust.TOO_LITTLE)
+            self.views[view.name] = view
+            return self.judged[view.name]
+        self.views[view.name] = view
+        self.judged[view.name] = Judged("waiting", "not solved yet")
+        if self.solution is None or self._adjustment is None:
+            if solve_now:
+                self.solve_afresh()
+            return self.judged[view.name]
+        self._admit(view)
+        if self.judged[view.name].fate == "used":
+            self._unsolved += 1
+        if self._unsolved and (solve_now or self._unsolved > 0.25 * len(self._adjustment.frames)):
+            self.solve_on()
+        return self.judged[view.name]
+
+    def remove(self, name: str) -> None:
+        """Forget a pair, as when its files were deleted."""
+        del self.views[name]
+        judged = self.judged.pop(name)
+        self._left_out.pop(name, None)
+        if judged.fate == "used" and self._adjustment is not None:
+            names = self._used_names(self._adjustment)
+            which = np.array([other == name for other in names])
+            if which.any() and (~which).sum() >= FEWEST:
+                self._adjustment.frames = self._adjustment.frames[~which]
+                self._adjustment.problem = adjust.without(self._adjustment.problem, which)
+                self._unsolved += 1
+            else:
+                self._forget("too few pairs are left")
+
+    def solve_on(self) -> None:
+        """Solve from the present solution; from nothing if the frames have grown much, or that fails."""
+        adjustment = self._adjustment
+        if adjustment is None or len(adjustment.frames) >= AFRESH * self._solved_afresh:
+            self.solve_afresh()
+            return
+        started = time.perf_counter()
+        try:
+            passes = settle(adjustment, self.chamber)
+        except SolveError:
+            self.solve_afresh()
+            return
+        seconds = time.perf_counter() - started
+        self.spent.add("solved on", seconds)
+        lost = {drop.name: drop.reason for drop in adjustment.dropped}
+        self._solved(package(adjustment, self._observations(adjustment), self.chamber, passes, seconds), lost)
+
+    def solve_afresh(self) -> None:
+        """Solve from nothing: all frames but those left out; frames rejected before may come in again."""
+        wanted = [name for name, judged in self.judged.items()
+                  if name not in self._left_out and judged.reason != adjust.TOO_LITTLE]  # fmt: skip
+        if len(wanted) < FEWEST:
+            self._forget(f"{len(wanted)} of the {FEWEST} pairs that a first solution needs")
+            return
+        observations = self.observations(wanted)
+        started = time.perf_counter()
+        try:
+            solution = solve(observations, self.lensmodel, self.chamber)
+        except (SolveError, ValueError) as error:
+            self._forget(str(error))
+            return
+        self.spent.add("solved afresh", time.perf_counter() - started)
+        corners = np.stack([observations.xy(role) for role in ROLES])
+        turned = np.isin(np.array(observations.names), solution.reordered)
+        corners[1, turned] = corners[1, turned][:, ::-1, ::-1]
+        self._adjustment = Adjustment(
+            solution.problem, corners, observations.names, solution.frames, [], solution.reordered
+        )
+        self._solved_afresh = len(solution.frames)
+        self._solved(solution, {drop.name: drop.reason for drop in solution.dropped})
+
+    # -- what there is ---------------------------------------------------------------------------------------------
+
+    def names(self, fate: Fate) -> tuple[str, ...]:
+        """Names of the frames of that fate."""
+        return tuple(name for name, judged in self.judged.items() if judged.fate == fate)
+
+    def observations(self, names: list[str] | tuple[str, ...]) -> Observations:
+        """These frames, as a calibration takes them."""
+        corners = np.stack([self.views[name].corners for name in names], 1)
+        return Observations(
+            self.board, tuple(names), corners[0], corners[1], dict(zip(ROLES, self.sizes, strict=True))
+        )
+
+    @property
+    def seconds_saved(self) -> float:
+        """What leaving frames out saved in the last solution, seconds: its time is in proportion to the frames."""
+        if self.solution is None or not self._left_out:
+            return 0.0
+        return self.solution.solve_seconds * len(self._left_out) / max(len(self.solution.names), 1)
+
+    def distance_of_last(self) -> float | None:
+        """How far away the board was in the newest frame that has a pose, metres."""
+        if self.solution is None:
+            return None
+        poses = {**dict(zip(self.solution.names, self.solution.rt_ref_board, strict=True)), **self._left_out}
+        newest = next((name for name in reversed(self.judged) if name in poses), None)
+        return None if newest is None else guidance.distance_of(self.board, poses[newest])
+
+    # -- within ----------------------------------------------------------------------------------------------------
+
+    def _admit(self, view: View) -> None:
+        """Give a new frame its pose and decide whether it joins the solution."""
+        adjustment, known = self._adjustment, self.known
+        if adjustment is None or known is None:
+            return
+        started = time.perf_counter()
+        problem = adjustment.problem
+        placed, corners = self._placed(problem, view.corners)
+        self.spent.add("placed", time.perf_counter() - started)
+        if placed is None:
+            self.judged[view.name] = Judged("rejected", "no pose of the board explains its corners")
+            return
+        misfit = adjust.fit(placed)
+        if misfit > max(MISFIT * known.noise, MISFIT_PX):
+            self.judged[view.name] = Judged(
+                "rejected", f"its corners are {misfit:.1f} px from where the other frames put them: taken at different "
+                "moments, or wrongly detected"
+            )  # fmt: skip
+            return
+        same = self._same_place(corners)
+        if same:
+            self.judged[view.name] = Judged("redundant", f"the board has not moved since {same}")
+            self._left_out[view.name] = placed.rt_ref_board[0]
+            return
+        gain = float(known.gain(self._information([placed.rt_ref_board[0]], [corners])[0]))
+        self._left_out[view.name] = placed.rt_ref_board[0]
+        self.judged[view.name] = Judged("redundant", _no_news(self.redundant), gain)
+        if not self._expendable():
+            del self._left_out[view.name]
+            self.judged[view.name] = Judged("used", "", gain)
+            self._append(view.name, corners, placed.rt_ref_board[0])
+
+    def _placed(self, problem: Problem, corners: Array) -> tuple[Problem | None, Array]:
+        """The pair alone under the present cameras; a chessboard's wet corners in the order that fits."""
+        orders = [corners]
+        if self.board.kind == "chessboard":
+            orders.append(np.stack([corners[0], corners[1][::-1, ::-1]]))
+        best: tuple[float, Problem | None, Array] = (np.inf, None, corners)
+        for order in orders:
+            try:
+                placed, there = posing.place(problem, order[:, None], self.chamber)
+            except SolveError:
+                continue
+            if there.all():
+                best = min(best, (adjust.fit(placed), placed, order), key=lambda found: found[0])
+                if best[0] < MISFIT_PX:
+                    break
+        return best[1], best[2]
+
+    def _same_place(self, corners: Array) -> str:
+        """A frame in which the board is where it is here, by its name; empty if there is none."""
+        for name in self.names("used"):
+            moved = np.linalg.norm(self.views[name].corners - corners, axis=-1)
+            both = np.isfinite(moved)
+            if both.any() and np.median(moved[both]) < SAME_PLACE_PX and both.sum() > 0.8 * np.isfinite(corners[..., 0]).sum():
+                return name
+        return ""
+
+    def _expendable(self) -> bool:
+        """Whether all frames left out together would lessen no sigma by more than the share agreed."""
+        apart = [name for name in self._left_out if "moved" not in self.judged[name].reason]
+        if not apart or self.known is None:
+            return True
+        told = self._information([self._left_out[name] for name in apart], [self.views[name].corners for name in apart])
+        return float(self.known.gain(told.sum(0))) <= self.redundant
+
+    def _information(self, poses: list[Array], corners: list[Array]) -> Array:
+        adjustment = self._adjustment
+        if adjustment is None:
+            raise ValueError("there is no solution yet; solve first")
+        problem = adjustment.problem
+        seen = np.isfinite(np.stack(corners, 1)[..., 0]).astype(np.float64)
+        return information.of_poses(problem, self.chamber, np.stack(poses), seen, problem.spacing)
+
+    def _append(self, name: str, corners: Array, pose: Array) -> None:
+        """Put a frame at the end of the problem; outliers so far stay marked."""
+        old = self._adjustment
+        if old is None:
+            return
+        everything = np.concatenate([old.corners[:, old.frames], corners[:, None]], 1)
+        names = (*self._used_names(old), name)
+        before = old.problem
+        fresh = adjust.assemble(everything, [(int(w), int(h)) for w, h in before.sizes], before.spacing)
+        fresh.observations[: len(before.observations)] = before.observations  # sorted by frame, so the new one is last
+        problem = before.copy(
+            observations=fresh.observations,
+            indices=fresh.indices,
+            rt_ref_board=np.concatenate([before.rt_ref_board, pose[None]]),
+        )
+        self._adjustment = Adjustment(problem, everything, names, np.arange(len(names)), [], old.reordered)
+
+    def _solved(self, solution: Solution, lost: dict[str, str]) -> None:
+        """Take over a new solution; name what it lost, and let in what can no longer be left out."""
+        adjustment = self._adjustment
+        if adjustment is None:
+            return
+        self.solution, self.trouble, self._unsolved = solution, "", 0
+        started = time.perf_counter()
+        seen = adjustment.problem.copy()
+        seen.observations[..., :2] = adjustment.seen()
+        self.known = guidance.certainty(solution.problem, self.chamber)
+        self.spent.add("certainty", time.perf_counter() - started)
+        for name in self._used_names(adjustment):
+            if self.judged[name].fate != "used":
+                self.judged[name] = replace(self.judged[name], fate="used", reason="")
+        for name, reason in lost.items():
+            self.judged[name] = Judged("rejected", reason)
+        while not self._expendable():
+            apart = [name for name in self._left_out if "moved" not in self.judged[name].reason]
+            told = self._information(
+                [self._left_out[name] for name in apart], [self.views[name].corners for name in apart]
+            )
+            gains = np.atleast_1d(self.known.gain(told))
+            best = apart[int(np.argmax(gains))]
+            pose = self._left_out.pop(best)
+            self.judged[best] = Judged("used", "", float(gains.max()))
+            self._append(best, self.views[best].corners, pose)
+            self._unsolved += 1
+
+    def _forget(self, trouble: str) -> None:
+        self.solution = self.known = self._adjustment = None
+        self.trouble, self._left_out, self._solved_afresh, self._unsolved = trouble, {}, 0, 0
+        for name, judged in self.judged.items():
+            if judged.reason != adjust.TOO_LITTLE:
+                self.judged[name] = Judged("waiting", trouble)
+
+    def _observations(self, adjustment: Adjustment) -> Observations:
+        return self.observations(adjustment.names)
+
+    @staticmethod
+    def _used_names(adjustment: Adjustment) -> tuple[str, ...]:
+        return tuple(adjustment.names[i] for i in adjustment.frames)
+
+
+def _no_news(share: float) -> str:
+    return f"with all others left out it would lessen no uncertainty by {share:.0%}"
