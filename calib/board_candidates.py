@@ -77,6 +77,17 @@ def outline(board: Board, border: float = 0.0, steps: int = 4) -> Array:
     return np.column_stack([x, y, np.tile(none, 4)])
 
 
+def mesh(board: Board, steps: int = 5) -> Array:
+    """Lines between squares from edge to edge, (L, steps, 3) metres: every one, or every second or third and so on of
+    a board of many squares."""
+    across, down = np.linspace(-1, board.columns, steps), np.linspace(-1, board.rows, steps)
+    columns = np.arange(0, board.columns, max(round(board.columns / 6), 1))
+    rows = np.arange(0, board.rows, max(round(board.rows / 6), 1))
+    lines = [np.column_stack([np.full(steps, column), down, np.zeros(steps)]) for column in columns]
+    lines += [np.column_stack([across, np.full(steps, row), np.zeros(steps)]) for row in rows]
+    return board.square * np.stack(lines)
+
+
 def drawn(rig: Rig, poses: Array, points: Array) -> Array:
     """Pixels, (cameras, K, N, 2), of points of boards, (N, 3), through the rig's chamber; NaN where not seen."""
     placed = np.einsum("kij,nj->kni", rotation_matrix(poses[:, :3]), points) + poses[:, None, 3:]

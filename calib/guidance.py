@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rainstereo.calib import board_candidates, information
+from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.board import Board
 from rainstereo.calib.board_candidates import Candidates
 from rainstereo.calib.far_directions import FarDirections, far_directions
@@ -80,8 +81,8 @@ class Certainty:
 class Proposal:
     """Where to hold the board next.
 
-    pose: (6,) rt_ref_board. outlines: per role (N, 2) pixels of the board's edge. corners: per role (4, 2), the print's
-    own corners, the first at corner [0, 0]'s side.
+    pose: (6,) rt_ref_board. outlines: per role (N, 2) pixels, the edge of the printed squares, a closed line. mesh: per
+    role, a few lines (N, 2) between squares, which show how the board leans.
     where, how_far, lean: in words; `words` joins them. distance: of its middle from the dry camera, metres.
     now, predicted: the largest sigma of far directions at present and with that frame, pixels; NaN before there is a
     calibration. considered: how many poses there were to choose from.
@@ -89,6 +90,7 @@ class Proposal:
 
     pose: Array
     outlines: dict[Role, Array]
+    mesh: dict[Role, tuple[Array, ...]]
     where: str
     how_far: str
     lean: str
@@ -118,8 +120,6 @@ def certainty(problem: Problem, chamber: Chamber | None) -> Certainty:
 
 def _noise(problem: Problem, known: Information, covariance: Array) -> float:
     """Of a corner's coordinate, from residuals and degrees of freedom; inf where there are none left."""
-    from rainstereo.calib import mrcal_versions as versions
-
     off = versions.residuals(problem)
     used = int(np.isfinite(off).sum())
     spent = float(np.sum(covariance * known.frames.sum(0))) + 6 * len(problem.rt_ref_board)
@@ -179,6 +179,7 @@ def offers(problem: Problem, chamber: Chamber | None, board: Board, possible: Ca
 
 def stride(rows: int, columns: int) -> int:
     """The coarsest step through a board's corners that still spans it and leaves a dozen."""
+
     def spans(step: int) -> bool:
         ends = [(step * ((n - 1) // step)) / (n - 1) for n in (rows, columns)]
         return min(ends) >= REACH and -(-rows // step) * -(-columns // step) >= LEAST_POINTS
@@ -210,9 +211,12 @@ def _described(rig: Rig, board: Board, possible: Candidates, index: int, last: f
     pose = possible.poses[index]
     distance = float(possible.distance[index])
     edges = board_candidates.drawn(rig, pose[None], board_candidates.outline(board))[:, 0]
+    lines = board_candidates.mesh(board)
+    inner = board_candidates.drawn(rig, pose[None], lines.reshape(-1, 3))[:, 0].reshape(2, *lines.shape[:2], 2)
     return Proposal(
         pose,
         dict(zip(ROLES, edges, strict=True)),
+        {role: tuple(view) for role, view in zip(ROLES, inner, strict=True)},
         SIDES[_key(possible.place[index])],
         _distance(distance, last),
         _lean(_key(possible.away[index])),

@@ -35,6 +35,9 @@ FEWEST = 3
 """Pairs before a first solution is tried."""
 AFRESH = 1.5
 """Growth of the frames after which all is solved from nothing."""
+GROWN = 0.2
+"""Frames that may join unsolved, as a share of those solved, while more are at hand."""
+ROUNDS = 3
 REDUNDANT = 0.03
 SAME_PLACE_PX = 1.5
 MISFIT, MISFIT_PX = 6.0, 2.0
@@ -73,6 +76,15 @@ class Spent:
         self.count[kind] = self.count.get(kind, 0) + 1
 
 
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A frame outside of the solution: rt_ref_board (6,), corners in the order that fits, and whether it moved."""
+
+    pose: Array
+    corners: Array
+    moved: bool = True
+
+
 class Running:
     """A calibration in progress. Not for several threads at once.
 
@@ -101,40 +113,63 @@ class Running:
         self.trouble = f"{FEWEST} pairs at least are needed"
         self.spent = Spent()
         self._adjustment: Adjustment | None = None
-        self._left_out: dict[str, Array] = {}  # name -> pose
-        self._solved_afresh = 0
-        self._unsolved = 0
+        self._left_out: dict[str, _Placed] = {}
+        self._solved_afresh = self._misfits = self._unsolved = 0
 
     # -- frames come and go ----------------------------------------------------------------------------------------
 
     def add(self, view: View, *, solve_now: bool = True) -> Judged:
-        """Take in a pair. solve_now: False where more follow at once; the solution is then renewed only now and then.
+        """Take in a pair. solve_now: False where more follow at once; `catch_up` then, after the last.
 
         A name that is known already is a ValueError.
         """
-        if view.name in self.views:
+        if view.name in self.judged:
             raise ValueError(f"frame {view.name!r} is here already; remove it first")
+        self.views[view.name] = view
         if not all(usable(corners) for corners in view.corners):
             self.judged[view.name] = Judged("rejected", adjust.TOO_LITTLE)
-            self.views[view.name] = view
             return self.judged[view.name]
-        self.views[view.name] = view
         self.judged[view.name] = Judged("waiting", "not solved yet")
-        if self.solution is None or self._adjustment is None:
-            if solve_now:
-                self.solve_afresh()
-            return self.judged[view.name]
-        self._admit(view)
-        if self.judged[view.name].fate == "used":
+        if self._adjustment is None:
             self._unsolved += 1
-        if self._unsolved and (solve_now or self._unsolved > 0.25 * len(self._adjustment.frames)):
+        else:
+            self._admit(view)
+            self._misfits += self.judged[view.name].fate == "rejected"
+        if solve_now:
+            self.catch_up()
+        elif self._due():
             self.solve_on()
         return self.judged[view.name]
 
+    def refuse(self, name: str, reason: str) -> Judged:
+        """Note a pair that shows nothing to calibrate from, and why."""
+        if name in self.judged:
+            raise ValueError(f"frame {name!r} is here already; remove it first")
+        self.judged[name] = Judged("rejected", reason)
+        return self.judged[name]
+
+    def catch_up(self) -> bool:
+        """Renew the solution if frames came or went since; whether there was anything to do."""
+        for done in range(ROUNDS):
+            if not self._unsolved and not (self._misfits and self._stale()):
+                return done > 0
+            self.solve_on()
+        return True
+
+    def _due(self) -> bool:
+        """Whether so much has come together that the solution is to be renewed although more is at hand."""
+        count = 0 if self._adjustment is None else len(self._adjustment.frames)
+        return self._unsolved > max(GROWN * count, FEWEST) or (self._misfits > 0 and self._stale())
+
+    def _stale(self) -> bool:
+        """Whether frames, used and refused, have grown so much that all is to be solved from nothing."""
+        count = 0 if self._adjustment is None else len(self._adjustment.frames)
+        return count + 2 * self._misfits >= AFRESH * self._solved_afresh
+
     def remove(self, name: str) -> None:
         """Forget a pair, as when its files were deleted."""
-        del self.views[name]
         judged = self.judged.pop(name)
+        self.views.pop(name, None)
         self._left_out.pop(name, None)
         if judged.fate == "used" and self._adjustment is not None:
             names = self._used_names(self._adjustment)
@@ -149,7 +184,7 @@ class Running:
     def solve_on(self) -> None:
         """Solve from the present solution; from nothing if the frames have grown much, or that fails."""
         adjustment = self._adjustment
-        if adjustment is None or len(adjustment.frames) >= AFRESH * self._solved_afresh:
+        if adjustment is None or self._stale():
             self.solve_afresh()
             return
         started = time.perf_counter()
@@ -165,8 +200,7 @@ class Running:
 
     def solve_afresh(self) -> None:
         """Solve from nothing: all frames but those left out; frames rejected before may come in again."""
-        wanted = [name for name, judged in self.judged.items()
-                  if name not in self._left_out and judged.reason != adjust.TOO_LITTLE]  # fmt: skip
+        wanted = [name for name in self.views if self._counts(name) and name not in self._left_out]
         if len(wanted) < FEWEST:
             self._forget(f"{len(wanted)} of the {FEWEST} pairs that a first solution needs")
             return
@@ -184,7 +218,7 @@ class Running:
         self._adjustment = Adjustment(
             solution.problem, corners, observations.names, solution.frames, [], solution.reordered
         )
-        self._solved_afresh = len(solution.frames)
+        self._solved_afresh, self._misfits = len(solution.frames), 0
         self._solved(solution, {drop.name: drop.reason for drop in solution.dropped})
 
     # -- what there is ---------------------------------------------------------------------------------------------
@@ -196,9 +230,7 @@ class Running:
     def observations(self, names: list[str] | tuple[str, ...]) -> Observations:
         """These frames, as a calibration takes them."""
         corners = np.stack([self.views[name].corners for name in names], 1)
-        return Observations(
-            self.board, tuple(names), corners[0], corners[1], dict(zip(ROLES, self.sizes, strict=True))
-        )
+        return Observations(self.board, tuple(names), corners[0], corners[1], dict(zip(ROLES, self.sizes, strict=True)))
 
     @property
     def seconds_saved(self) -> float:
@@ -211,7 +243,8 @@ class Running:
         """How far away the board was in the newest frame that has a pose, metres."""
         if self.solution is None:
             return None
-        poses = {**dict(zip(self.solution.names, self.solution.rt_ref_board, strict=True)), **self._left_out}
+        poses = dict(zip(self.solution.names, self.solution.rt_ref_board, strict=True))
+        poses |= {name: placed.pose for name, placed in self._left_out.items()}
         newest = next((name for name in reversed(self.judged) if name in poses), None)
         return None if newest is None else guidance.distance_of(self.board, poses[newest])
 
@@ -236,18 +269,22 @@ class Running:
                 "moments, or wrongly detected"
             )  # fmt: skip
             return
-        same = self._same_place(corners)
+        pose = placed.rt_ref_board[0]
+        same = self._same_place(view.corners)
+        self._left_out[view.name] = _Placed(pose, corners, moved=not same)
         if same:
             self.judged[view.name] = Judged("redundant", f"the board has not moved since {same}")
-            self._left_out[view.name] = placed.rt_ref_board[0]
             return
-        gain = float(known.gain(self._information([placed.rt_ref_board[0]], [corners])[0]))
-        self._left_out[view.name] = placed.rt_ref_board[0]
+        gain = float(known.gain(self._information([view.name])[0]))
         self.judged[view.name] = Judged("redundant", _no_news(self.redundant), gain)
         if not self._expendable():
-            del self._left_out[view.name]
-            self.judged[view.name] = Judged("used", "", gain)
-            self._append(view.name, corners, placed.rt_ref_board[0])
+            self._let_in(view.name, gain)
+
+    def _let_in(self, name: str, gain: float) -> None:
+        placed = self._left_out.pop(name)
+        self.judged[name] = Judged("used", "", gain)
+        self._append(name, placed.corners, placed.pose)
+        self._unsolved += 1
 
     def _placed(self, problem: Problem, corners: Array) -> tuple[Problem | None, Array]:
         """The pair alone under the present cameras; a chessboard's wet corners in the order that fits."""
@@ -268,28 +305,34 @@ class Running:
 
     def _same_place(self, corners: Array) -> str:
         """A frame in which the board is where it is here, by its name; empty if there is none."""
+        seen = np.isfinite(corners[..., 0]).sum()
         for name in self.names("used"):
             moved = np.linalg.norm(self.views[name].corners - corners, axis=-1)
             both = np.isfinite(moved)
-            if both.any() and np.median(moved[both]) < SAME_PLACE_PX and both.sum() > 0.8 * np.isfinite(corners[..., 0]).sum():
+            if both.sum() > 0.8 * seen and np.median(moved[both]) < SAME_PLACE_PX:
                 return name
         return ""
 
+    def _apart(self) -> list[str]:
+        """Frames left out for what they say, not because the board has not moved."""
+        return [name for name, placed in self._left_out.items() if placed.moved]
+
     def _expendable(self) -> bool:
         """Whether all frames left out together would lessen no sigma by more than the share agreed."""
-        apart = [name for name in self._left_out if "moved" not in self.judged[name].reason]
+        apart = self._apart()
         if not apart or self.known is None:
             return True
-        told = self._information([self._left_out[name] for name in apart], [self.views[name].corners for name in apart])
-        return float(self.known.gain(told.sum(0))) <= self.redundant
+        return float(self.known.gain(self._information(apart).sum(0))) <= self.redundant
 
-    def _information(self, poses: list[Array], corners: list[Array]) -> Array:
+    def _information(self, names: list[str]) -> Array:
+        """What frames left out say, (K, G, G)."""
         adjustment = self._adjustment
         if adjustment is None:
             raise ValueError("there is no solution yet; solve first")
-        problem = adjustment.problem
-        seen = np.isfinite(np.stack(corners, 1)[..., 0]).astype(np.float64)
-        return information.of_poses(problem, self.chamber, np.stack(poses), seen, problem.spacing)
+        placed = [self._left_out[name] for name in names]
+        seen = np.isfinite(np.stack([each.corners[..., 0] for each in placed], 1)).astype(np.float64)
+        poses = np.stack([each.pose for each in placed])
+        return information.of_poses(adjustment.problem, self.chamber, poses, seen, adjustment.problem.spacing)
 
     def _append(self, name: str, corners: Array, pose: Array) -> None:
         """Put a frame at the end of the problem; outliers so far stay marked."""
@@ -315,8 +358,6 @@ class Running:
             return
         self.solution, self.trouble, self._unsolved = solution, "", 0
         started = time.perf_counter()
-        seen = adjustment.problem.copy()
-        seen.observations[..., :2] = adjustment.seen()
         self.known = guidance.certainty(solution.problem, self.chamber)
         self.spent.add("certainty", time.perf_counter() - started)
         for name in self._used_names(adjustment):
@@ -325,23 +366,20 @@ class Running:
         for name, reason in lost.items():
             self.judged[name] = Judged("rejected", reason)
         while not self._expendable():
-            apart = [name for name in self._left_out if "moved" not in self.judged[name].reason]
-            told = self._information(
-                [self._left_out[name] for name in apart], [self.views[name].corners for name in apart]
-            )
-            gains = np.atleast_1d(self.known.gain(told))
-            best = apart[int(np.argmax(gains))]
-            pose = self._left_out.pop(best)
-            self.judged[best] = Judged("used", "", float(gains.max()))
-            self._append(best, self.views[best].corners, pose)
-            self._unsolved += 1
+            apart = self._apart()
+            gains = self.known.gain(self._information(apart))
+            self._let_in(apart[int(np.argmax(gains))], float(gains.max()))
 
     def _forget(self, trouble: str) -> None:
         self.solution = self.known = self._adjustment = None
-        self.trouble, self._left_out, self._solved_afresh, self._unsolved = trouble, {}, 0, 0
-        for name, judged in self.judged.items():
-            if judged.reason != adjust.TOO_LITTLE:
-                self.judged[name] = Judged("waiting", trouble)
+        self.trouble, self._left_out, self._misfits = trouble, {}, 0
+        self._solved_afresh = self._unsolved = 0
+        for name in filter(self._counts, self.views):
+            self.judged[name] = Judged("waiting", trouble)
+
+    def _counts(self, name: str) -> bool:
+        """Whether a frame shows enough of the board to both cameras."""
+        return self.judged[name].reason != adjust.TOO_LITTLE
 
     def _observations(self, adjustment: Adjustment) -> Observations:
         return self.observations(adjustment.names)
