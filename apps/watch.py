@@ -29,14 +29,12 @@ from rainstereo.calib.board import Board
 from rainstereo.calib.checks import MORE_VIEWS, Finding, Verdict
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.rejection import NotEnoughData, Rejection
-from rainstereo.calib.running import FEWEST
+from rainstereo.calib.running import AUTOMATIC, FEWEST, SPLINED
 from rainstereo.rig import ROLES
 
 BETWEEN_LOOKS_S = 0.15
 FAREWELL_S = 1.2
 """How long the page is still served at the end, where one is open, so that it can show the end."""
-CAPTURING_MODEL = calibrate.FALLBACK
-"""Lens model while capturing where cross-validation is to choose one at the end."""
 TOLERATED = 1.02
 _TARGET = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*(px)?\s*")
 
@@ -50,10 +48,8 @@ def run(options: calibrate.Options) -> int:
     board = Board.parse(options.board)
     chamber = None if options.chamber is None else Chamber.load(options.chamber)
     mrcal_versions.load()
-    automatic = options.lensmodel == "auto"
-    lensmodel = CAPTURING_MODEL if automatic else options.lensmodel
-    if not automatic and lensmodel != "splined":
-        mrcal_versions.parameters(lensmodel)
+    if options.lensmodel not in (AUTOMATIC, SPLINED):
+        mrcal_versions.parameters(options.lensmodel)
     cache = options.cache or options.out / "corners"
     options = replace(options, cache=cache)
     record = Record("calibrate", options)
@@ -67,7 +63,7 @@ def run(options: calibrate.Options) -> int:
             served.show(state, picture)
             screen.show(state, server.url)
 
-        session = Session(folder, board, lensmodel, chamber, target, cache, publish, screen.event)
+        session = Session(folder, board, options.lensmodel, chamber, target, cache, publish, screen.event)
         clock = calibrate.Clock()
         findings = _watch(session, options, chamber, screen, clock)
         screen.close()
@@ -124,7 +120,7 @@ def _confirmed(session: Session, findings: Findings, screen: Screen) -> bool:
         session.phase = "capturing"
         return False
     worst = worst_of(findings)
-    if worst <= TOLERATED * session.target or solution.lensmodel == session.lensmodel:
+    if worst <= TOLERATED * session.target or solution.lensmodel == session.solved_with:
         return True
     screen.say(f"with {solution.lensmodel}, which predicts frames better, the worst place is {worst:.3f} px; going on")
     session.use_lensmodel(solution.lensmodel)
@@ -184,7 +180,7 @@ def account(session: Session, findings: Findings) -> dict[str, Any]:
     seconds = [time for _, time in session.updates]
     return told | {
         "worst_while_capturing_px": np.inf if running.known is None else running.known.worst,
-        "lensmodel_while_capturing": running.lensmodel,
+        "lensmodel_while_capturing": session.solved_with,
         "frames": {name: {"fate": j.fate, "reason": j.reason, "gain": j.gain} for name, j in running.judged.items()},
         "fates": dict(Counter(judged.fate for judged in running.judged.values())),
         "redundant_share": running.redundant,

@@ -15,13 +15,14 @@ PAGE = (
 :root{--back:#0a0e13;--ink:#fff;--dim:#b9c4d0;--wait:#ffc23d;--good:#39e58c;--bad:#ff6b6b;--line:#2b3642}
 *{box-sizing:border-box;margin:0}
 html,body{height:100%}
-body{background:var(--back);color:var(--ink);font:16px/1.2 system-ui,-apple-system,"Segoe UI",Roboto,Helvetica,Arial,
-  "DejaVu Sans",sans-serif;display:grid;grid-template:minmax(0,1fr) auto/minmax(0,1.62fr) minmax(0,1fr);gap:1.4vmin;
+body{background:var(--back);color:var(--ink);
+  font:16px/1.2 system-ui,-apple-system,"Segoe UI",Roboto,Helvetica,Arial,"DejaVu Sans",sans-serif;display:grid;grid-template:minmax(0,1fr) auto/minmax(0,1.62fr) minmax(0,1fr);gap:1.4vmin;
   padding:1.6vmin;overflow:hidden}
 #view{min-height:0;min-width:0;display:flex;align-items:center;justify-content:center;position:relative}
 #view svg{width:100%;height:100%;max-height:100%;display:block}
 #side{display:flex;flex-direction:column;min-height:0;gap:1.4vmin;justify-content:space-between}
-#figure{font-weight:800;font-size:min(12.5vw,27vh);line-height:.86;letter-spacing:-.045em;font-variant-numeric:tabular-nums;
+#figure{font-weight:800;font-size:min(12.5vw,27vh);line-height:.86;letter-spacing:-.045em;
+  font-variant-numeric:tabular-nums;
   white-space:nowrap;color:var(--wait)}
 #figure small{font-size:.26em;font-weight:600;letter-spacing:0;margin-left:.12em;color:var(--ink)}
 #target{font-size:min(2.5vw,4.4vh);font-weight:600;color:var(--dim);margin-top:.5vmin}
@@ -33,7 +34,8 @@ body{background:var(--back);color:var(--ink);font:16px/1.2 system-ui,-apple-syst
 #do .lean{color:#8fd3ff}
 #last{grid-column:1/-1;display:flex;gap:2vmin;align-items:center;justify-content:space-between;font-size:min(2.3vw,4vh);
   font-weight:600;min-height:1.5em;border-top:.3vmin solid var(--line);padding-top:1vmin}
-#fate{min-width:0;overflow:hidden;text-overflow:ellipsis;display:-webkit-box;-webkit-line-clamp:2;-webkit-box-orient:vertical}
+#fate{min-width:0;overflow:hidden;text-overflow:ellipsis;display:-webkit-box;-webkit-line-clamp:2;
+  -webkit-box-orient:vertical}
 #fate b{font-weight:800;padding:.05em .4em;border-radius:.25em;color:#0a0e13;background:var(--dim);margin-right:.4em}
 #fate.used b{background:var(--good)}#fate.redundant b{background:#8fd3ff}#fate.rejected b{background:var(--bad)}
 #counts{white-space:nowrap;color:var(--dim);flex:none}
@@ -93,9 +95,11 @@ function draw(s){
   const p=s.proposal, wanted=s.phase==="learning"||s.phase==="capturing"||s.phase==="waiting";
   if(p&&wanted){
     const edge=p.outline.dry;
-    el("polygon",{points:smooth(edge),fill:"#fff","fill-opacity":.16,stroke:"#000","stroke-width":w/70,"stroke-linejoin":"round"},svg);
+    el("polygon",{points:smooth(edge),fill:"#fff","fill-opacity":.16,stroke:"#000","stroke-width":w/70,
+      "stroke-linejoin":"round"},svg);
     for(const line of p.mesh.dry)el("polyline",{points:smooth(line),fill:"none",stroke:"#fff","stroke-width":w/420},svg);
-    el("polygon",{id:"outline",points:smooth(edge),fill:"none",stroke:"#fff","stroke-width":w/110,"stroke-linejoin":"round"},svg);
+    el("polygon",{id:"outline",points:smooth(edge),fill:"none",stroke:"#fff","stroke-width":w/110,
+      "stroke-linejoin":"round"},svg);
   }
   el("rect",{x:0,y:0,width:w,height:h,fill:"none",stroke:"#fff","stroke-width":w/320},svg);
   svg.classList.toggle("flipped",mirrored);
@@ -127,7 +131,8 @@ function show(s){
     fate.append(b,s.last.name+(s.last.reason?": "+s.last.reason:""))}
   const counts=$("counts");counts.replaceChildren();
   for(const [n,what] of [[s.used,"used"],[s.redundant,"redundant"],[s.rejected,"rejected"],[s.pending,"to come"]])
-    if(n||what==="used"){const b=document.createElement("b");b.textContent=n;counts.append(counts.childNodes.length?"  ·  ":"",b," "+what)}
+    if(n||what==="used"){const b=document.createElement("b");b.textContent=n;
+      counts.append(counts.childNodes.length?"  ·  ":"",b," "+what)}
   say($("notes"),[s.phase==="learning"?s.trouble:""].concat(s.notes||[]).filter(Boolean).slice(-3).join("  ·  "));
   document.title=(s.phase==="met"||s.phase==="done"?"✓ ":"")+px(s.figure)+" px";
 }

@@ -62,8 +62,8 @@ class PageServer:
             self._server = ThreadingHTTPServer((LOOPBACK, port), _handler(served))
         except OSError as error:
             raise ValueError(
-                f"port {port} of this machine cannot be used ({error.strerror or error}): another capture may be running; "
-                "give --port 0 for any that is free"
+                f"port {port} of this machine cannot be used ({error.strerror or error}): another capture may be "
+                "running; give --port 0 for any that is free"
             ) from error
         self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
@@ -98,7 +98,7 @@ def _handler(served: Served) -> Callable[..., BaseHTTPRequestHandler]:
         def do_HEAD(self) -> None:
             self._reply(False)
 
-        def log_message(self, format: str, *arguments: Any) -> None:
+        def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002 - the base class names it so
             """Nothing: the terminal belongs to the capture."""
 
         def _reply(self, body: bool) -> None:

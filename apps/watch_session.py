@@ -70,6 +70,12 @@ class Session:
             and running.known.worst <= self.target
         )
 
+    @property
+    def solved_with(self) -> str:
+        """mrcal's name of the present solution's lens model; empty without one."""
+        solution = None if self.running is None else self.running.solution
+        return "" if solution is None else solution.lensmodel
+
     def step(self) -> bool:
         """Look once; whether anything was done."""
         look = self._arrivals.look()

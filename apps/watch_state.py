@@ -106,7 +106,7 @@ def state_of(
         None if proposal is None else _drawn(proposal),
         trouble or running.trouble,
         told,
-        running.lensmodel.removeprefix("LENSMODEL_").split("_STEREOGRAPHIC")[0],
+        "" if running.solution is None else running.solution.lensmodel.removeprefix("LENSMODEL_").split("_STEREO")[0],
         picture,
     )
 

@@ -31,6 +31,11 @@ from rainstereo.chamber import Chamber
 from rainstereo.rig import ROLES
 from rainstereo.types import Array
 
+AUTOMATIC, SPLINED = "auto", "splined"
+PLAIN_AND_RICH = ("LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8")
+PAYS, PAYS_FROM = 0.95, 6
+"""The richer lens model is taken from this many frames on, where it lowers the noise to this share at least: with few
+frames its rational function may have a pole in a corner of the image where no board was."""
 FEWEST = 3
 """Pairs before a first solution is tried."""
 AFRESH = 1.5
@@ -103,9 +108,10 @@ class Running:
     ) -> None:
         if not 0 <= redundant < 1:
             raise ValueError(f"frames that lessen no sigma by a share of {redundant} are redundant; expected 0 to 1")
-        versions.parameters(lensmodel)
-        self.board, self.sizes, self.lensmodel, self.chamber = board, sizes, lensmodel, chamber
-        self.redundant = redundant
+        if lensmodel not in (AUTOMATIC, SPLINED):
+            versions.parameters(lensmodel)
+        self.board, self.sizes, self.chamber, self.redundant = board, sizes, chamber, redundant
+        self.lensmodels = PLAIN_AND_RICH if lensmodel == AUTOMATIC else (lensmodel,)
         self.views: dict[str, View] = {}
         self.judged: dict[str, Judged] = {}
         self.solution: Solution | None = None
@@ -207,7 +213,7 @@ class Running:
         observations = self.observations(wanted)
         started = time.perf_counter()
         try:
-            solution = solve(observations, self.lensmodel, self.chamber)
+            solution = self._best(observations)
         except (SolveError, ValueError) as error:
             self._forget(str(error))
             return
@@ -220,6 +226,15 @@ class Running:
         )
         self._solved_afresh, self._misfits = len(solution.frames), 0
         self._solved(solution, {drop.name: drop.reason for drop in solution.dropped})
+
+    def _best(self, observations: Observations) -> Solution:
+        """From nothing, with the lens model given, or with the plain one unless the rich one pays."""
+        plain = solve(observations, self.lensmodels[0], self.chamber)
+        if len(self.lensmodels) == 1 or len(observations) < PAYS_FROM:
+            return plain
+        rich = solve(observations, self.lensmodels[1], self.chamber)
+        noise = [guidance.certainty(found.problem, self.chamber).noise for found in (plain, rich)]
+        return rich if noise[1] < PAYS * noise[0] or len(rich.frames) > len(plain.frames) else plain
 
     # -- what there is ---------------------------------------------------------------------------------------------
 
