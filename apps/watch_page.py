@@ -15,9 +15,9 @@ PAGE = (
 :root{--back:#0a0e13;--ink:#fff;--dim:#b9c4d0;--wait:#ffc23d;--good:#39e58c;--bad:#ff6b6b;--line:#2b3642}
 *{box-sizing:border-box;margin:0}
 html,body{height:100%}
-body{background:var(--back);color:var(--ink);
-  font:16px/1.2 system-ui,-apple-system,"Segoe UI",Roboto,Helvetica,Arial,"DejaVu Sans",sans-serif;display:grid;grid-template:minmax(0,1fr) auto/minmax(0,1.62fr) minmax(0,1fr);gap:1.4vmin;
-  padding:1.6vmin;overflow:hidden}
+body{background:var(--back);color:var(--ink);overflow:hidden;padding:1.6vmin;gap:1.4vmin;display:grid;
+  font:16px/1.2 system-ui,-apple-system,"Segoe UI",Roboto,Helvetica,Arial,"DejaVu Sans",sans-serif;
+  grid-template:minmax(0,1fr) auto/minmax(0,1.62fr) minmax(0,1fr)}
 #view{min-height:0;min-width:0;display:flex;align-items:center;justify-content:center;position:relative}
 #view svg{width:100%;height:100%;max-height:100%;display:block}
 #side{display:flex;flex-direction:column;min-height:0;gap:1.4vmin;justify-content:space-between}
@@ -59,8 +59,9 @@ body.failed,body.lost{background:#4a0f14}body.failed #figure,body.lost #figure{c
 }
 </style></head>
 <body class="waiting">
-<div id="view"><svg id="image" role="img" aria-label="The dry camera's image: certainty by cell, and where to hold the board">
-</svg><button id="mirror" aria-pressed="false">mirror</button></div>
+<div id="view">
+<svg id="image" role="img" aria-label="The dry image: certainty by cell, and where to hold the board"></svg>
+<button id="mirror" aria-pressed="false">mirror</button></div>
 <div id="side"><div><div id="figure">&ndash;</div><div id="target"></div><div id="bar"><i></i></div></div>
 <div id="do"><div class="where">Starting</div><div class="more"></div><div class="lean"></div></div>
 <div id="notes"></div></div>
@@ -97,7 +98,8 @@ function draw(s){
     const edge=p.outline.dry;
     el("polygon",{points:smooth(edge),fill:"#fff","fill-opacity":.16,stroke:"#000","stroke-width":w/70,
       "stroke-linejoin":"round"},svg);
-    for(const line of p.mesh.dry)el("polyline",{points:smooth(line),fill:"none",stroke:"#fff","stroke-width":w/420},svg);
+    for(const line of p.mesh.dry)
+      el("polyline",{points:smooth(line),fill:"none",stroke:"#fff","stroke-width":w/420},svg);
     el("polygon",{id:"outline",points:smooth(edge),fill:"none",stroke:"#fff","stroke-width":w/110,
       "stroke-linejoin":"round"},svg);
   }
@@ -122,7 +124,7 @@ function show(s){
   const figure=$("figure");
   figure.replaceChildren(document.createTextNode(px(s.figure)));
   if(s.figure!==null){const unit=document.createElement("small");unit.textContent="px";figure.appendChild(unit)}
-  say($("target"),s.figure===null?`target ${px(s.target)} px`:`target ${px(s.target)} px · worst: ${sides(s.worst_at)}`);
+  say($("target"),`target ${px(s.target)} px`+(s.figure===null?"":` · worst: ${sides(s.worst_at)}`));
   const share=s.figure===null?0:s.figure<=s.target?1:Math.max(.02,1-Math.log(s.figure/s.target)/Math.log(60));
   $("bar").firstElementChild.style.width=(100*share).toFixed(1)+"%";
   words(s);draw(s);

@@ -9,7 +9,7 @@ since one board can hardly improve two opposite corners of an image.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from rainstereo.types import Array
 
 POWER = 8.0
 """Of the mean over places that stands in for the largest sigma."""
+COUNTS = 0.4
+"""Places below this share of the largest sigma do not count: a share of 0.4 ** 8, less than a thousandth."""
 LEAST_POINTS, REACH = 12, 0.9
 SIDES = {(0, 0): "centre", (-1, 0): "left edge", (1, 0): "right edge", (0, -1): "top edge", (0, 1): "bottom edge",
          (-1, -1): "top left corner", (1, -1): "top right corner", (-1, 1): "bottom left corner",
@@ -158,10 +160,16 @@ def propose(
     if not len(possible.poses):
         return None
     offered = offers(problem, chamber, board, possible)
-    sigmas = known.with_frames(offered)
-    scale = float(known.sigmas.max())
-    index = int(np.argmin(np.mean((sigmas / scale) ** POWER, -1)))
-    return _described(rig, board, possible, index, last, known.worst, float(sigmas[index].max()))
+    index = best(known, offered)
+    return _described(rig, board, possible, index, last, known.worst, float(known.with_frames(offered[index]).max()))
+
+
+def best(known: Certainty, offered: Array) -> int:
+    """Which of the frames offered, (K, G, G), leaves the least power mean of the sigmas."""
+    high = known.sigmas > COUNTS * known.sigmas.max()  # the others do not count, and no frame makes them grow
+    far = replace(known.far, derivative=known.far.derivative[high])
+    sigmas = far.sigmas(information.inverse(known.information.total + offered)) / far.sigmas(known.covariance).max()
+    return int(np.argmin(np.mean(sigmas**POWER, -1)))
 
 
 def offers(problem: Problem, chamber: Chamber | None, board: Board, possible: Candidates) -> Array:
