@@ -117,7 +117,8 @@ def _compact(where: Layout) -> Layout:
 
 def inverse(total: Array) -> Array:
     """Inverses of information matrices, (..., G, G); what they leave open gets a large finite variance."""
-    scale = 1 / np.sqrt(np.maximum(np.einsum("...ii->...i", total), 1e-300))
+    diagonal = np.einsum("...ii->...i", total)
+    scale = 1 / np.sqrt(np.maximum(diagonal, 1e-30 * diagonal.max(-1, keepdims=True) + 1e-200))
     both = scale[..., :, None] * scale[..., None, :]
     scaled = total * both
     if total.ndim > 2:  # many: a ridge does what the limit on eigenvalues does below, five times as fast
