@@ -85,7 +85,7 @@ def mesh(board: Board, steps: int = 5) -> Array:
     rows = np.arange(0, board.rows, max(round(board.rows / 6), 1))
     lines = [np.column_stack([np.full(steps, column), down, np.zeros(steps)]) for column in columns]
     lines += [np.column_stack([across, np.full(steps, row), np.zeros(steps)]) for row in rows]
-    return board.square * np.stack(lines)
+    return np.asarray(board.square * np.stack(lines))
 
 
 def drawn(rig: Rig, poses: Array, points: Array) -> Array:

@@ -172,22 +172,17 @@ def test_a_proposal_keeps_its_promise() -> None:
     assert proposal is not None
     assert proposal.considered > 100
     assert proposal.predicted < 0.9 * proposal.now
-    poses = np.concatenate([solution.rt_ref_board, proposal.pose[None]])
+    now = certain()
+    assert proposal.now == now.worst
+    poses = np.concatenate([synthetic.poses(10, 3, near=0.3), proposal.pose[None]])
     again = solve(synthetic.observe(true, poses, noise=NOISE, seed=5), MODEL, true.chamber)
     actual = guidance.certainty(again.problem, true.chamber)
-    assert actual.worst / actual.noise == pytest.approx(
-        proposal.predicted / (proposal.now / _worst(solution)), rel=0.15
-    )
+    # the noise itself is estimated anew: compare what the geometry makes of a pixel of it
+    assert actual.worst / actual.noise == pytest.approx(proposal.predicted / now.noise, rel=0.05)
     for role in ROLES:
         assert (proposal.outlines[role] >= -0.5).all()
         assert (proposal.outlines[role] <= np.array(synthetic.SIZE) - 0.5).all()
     assert "cm away" in proposal.words
-
-
-def _worst(solution: Solution) -> float:
-    """The present worst sigma at a noise of one pixel."""
-    known = guidance.certainty(solution.problem, solution.rig.chamber)
-    return known.worst / known.noise
 
 
 def test_the_proposal_is_better_than_nearly_all_other_poses() -> None:
@@ -197,7 +192,7 @@ def test_the_proposal_is_better_than_nearly_all_other_poses() -> None:
     told = guidance.offers(solution.problem, true.chamber, synthetic.BOARD, possible)
     every = information.of_poses(solution.problem, true.chamber, possible.poses, possible.seen.astype(float), 0.022)
     worst, thinned = known.with_frames(every).max(-1), known.with_frames(told).max(-1)
-    np.testing.assert_allclose(thinned, worst, rtol=0.12)  # a part of the corners stands for all
+    np.testing.assert_allclose(thinned, worst, rtol=0.2)  # a part of the corners stands for all
     assert worst[guidance.best(known, told)] <= np.quantile(worst, 0.1)
 
 
