@@ -13,9 +13,10 @@ from rainstereo.apps.bench_calibration import BOARD, MODEL, NOISE_PX, infinity_e
 from rainstereo.apps.bench_harness import Stage, Target, Variant, Work
 from rainstereo.apps.board_poses import board_poses
 from rainstereo.apps.digital_rig import digital_rig, exact_observations
-from rainstereo.apps.guided_capture import Captured, capture
+from rainstereo.apps.guided_capture import Captured, anywhere, capture, unsteady
 from rainstereo.calib import guidance
 from rainstereo.calib.guidance import Proposal
+from rainstereo.calib.observations import Observations
 from rainstereo.calib.running import Running, View
 from rainstereo.calib.solve import Solution, solve
 
@@ -27,6 +28,7 @@ def build(seed: int, quick: bool) -> Stage:
     """Updates at 15, 30 and 60 pairs, the proposal, and captures with three seeds; little of each if `quick`."""
     works = [_update(pairs, seed) for pairs in ((10,) if quick else (15, 30, 60))]
     works.append(_propose(10 if quick else 30, seed))
+    works.append(_redundant(10 if quick else 60, seed))
     works.append(_frames(QUICK_TARGET_PX if quick else TARGET_PX, 1 if quick else SEEDS, seed))
     return Stage(
         "guidance",
@@ -138,6 +140,41 @@ def _propose(pairs: int, seed: int) -> Work:
         "of the worst sigma that was promised",
         targets=(Target("propose", None, 0.3),),
     )  # fmt: skip
+
+
+def _redundant(pairs: int, seed: int) -> Work:
+    truth = digital_rig(seed=seed)
+    rng = np.random.default_rng([seed, 0x2ED])
+    poses = np.stack([anywhere(truth, BOARD, rng) for _ in range(pairs // 2)])
+    again = np.stack([unsteady(truth, BOARD, pose, rng) for pose in poses])
+    still = poses[:: max(pairs // 12, 1)]
+    held = np.concatenate([poses, again, still])
+    dry, wet = (corners + rng.normal(0, NOISE_PX, corners.shape) for corners in exact_observations(truth, BOARD, held))
+    running = Running(BOARD, (truth.dry.size, truth.wet.size), MODEL, truth.chamber)
+    for i in rng.permutation(len(held)):
+        running.add(View(f"{i:03d}", np.stack([dry[i], wet[i]])), solve_now=False)
+    running.catch_up()
+    used, everything = running.observations(running.names("used")), running.observations(tuple(running.judged))
+
+    def variant(name: str, observations: Observations) -> Variant:
+        return Variant(
+            name,
+            lambda: solve(observations, MODEL, truth.chamber),
+            lambda solution: infinity_error(solution.rig, truth),
+            True,
+            f"{len(observations)} pairs",
+        )
+
+    return Work(
+        "redundant",
+        f"{len(held)} pairs, many nearly alike",
+        f"Boards held anywhere {pairs // 2} times, then once more nearly there, and {len(still)} times without having "
+        f"moved; frames that together lessen no sigma by {running.redundant:.0%} are left out.",
+        (variant("redundant left out", used), variant("all pairs", everything)),
+        "redundant left out",
+        "px",
+        "of directions at infinity, RMS over both images",
+    )
 
 
 def _frames(target: float, seeds: int, seed: int) -> Work:

@@ -89,21 +89,19 @@ def pixels(text: str) -> float:
 def _watch(session: Session, options: calibrate.Options, chamber: Chamber | None, screen: Screen,
            clock: calibrate.Clock) -> Findings:  # fmt: skip
     """Until the target is met by the final solution, or the user ends it: what the frames used came to."""
-    announced = 0
+    examined, announced = 0, False
     try:
         while True:
             busy = session.step()
             used = 0 if session.running is None else len(session.running.names("used"))
-            if session.met and used > announced:
-                announced = used
-                if not options.keep_going:
-                    findings = _final(session, options, chamber, clock)
-                    if _confirmed(session, findings, screen):
-                        return findings
-                elif session.phase == "met":
-                    screen.say(
-                        f"the target of {session.target:g} px is met with {used} frames; going on (--keep-going)"
-                    )
+            if session.met and options.keep_going and not announced:
+                announced = True
+                screen.say(f"the target of {session.target:g} px is met with {used} frames; going on until Ctrl-C")
+            elif session.met and not options.keep_going and used > examined:
+                examined = used
+                findings = _final(session, options, chamber, clock)
+                if _confirmed(session, findings, screen):
+                    return findings
             if not busy:
                 time.sleep(BETWEEN_LOOKS_S)
     except KeyboardInterrupt:

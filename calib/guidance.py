@@ -76,7 +76,8 @@ class Certainty:
 
     def gain(self, frames: Array) -> Array:
         """By which share, (...), information, (..., G, G), would lessen the sigma of the place that it helps most."""
-        return np.asarray((1 - self.with_frames(frames) / self.sigmas).max(-1))
+        after = self.far.sigmas(information.inverse(self.information.total + frames))
+        return np.asarray((1 - after / self.far.sigmas(self.covariance)).max(-1))
 
 
 @dataclass(frozen=True, eq=False)

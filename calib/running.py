@@ -83,11 +83,14 @@ class Spent:
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """A frame outside of the solution: rt_ref_board (6,), corners in the order that fits, and whether it moved."""
+    """A frame outside of the solution: rt_ref_board (6,), corners in the order that fits.
+
+    like: the name of a frame in which the board is in the same place; empty where there is none.
+    """
 
     pose: Array
     corners: Array
-    moved: bool = True
+    like: str = ""
 
 
 class Running:
@@ -177,6 +180,7 @@ class Running:
         judged = self.judged.pop(name)
         self.views.pop(name, None)
         self._left_out.pop(name, None)
+        likenesses = [other for other, placed in self._left_out.items() if placed.like == name]
         if judged.fate == "used" and self._adjustment is not None:
             names = self._used_names(self._adjustment)
             which = np.array([other == name for other in names])
@@ -186,6 +190,11 @@ class Running:
                 self._unsolved += 1
             else:
                 self._forget("too few pairs are left")
+        for other in likenesses:  # one of them takes the place of the frame that is gone
+            view = self.views.pop(other)
+            del self.judged[other]
+            self._left_out.pop(other, None)
+            self.add(view, solve_now=False)
 
     def solve_on(self) -> None:
         """Solve from the present solution; from nothing if the frames have grown much, or that fails."""
@@ -286,7 +295,7 @@ class Running:
             return
         pose = placed.rt_ref_board[0]
         same = self._same_place(view.corners)
-        self._left_out[view.name] = _Placed(pose, corners, moved=not same)
+        self._left_out[view.name] = _Placed(pose, corners, same)
         if same:
             self.judged[view.name] = Judged("redundant", f"the board has not moved since {same}")
             return
@@ -330,7 +339,7 @@ class Running:
 
     def _apart(self) -> list[str]:
         """Frames left out for what they say, not because the board has not moved."""
-        return [name for name, placed in self._left_out.items() if placed.moved]
+        return [name for name, placed in self._left_out.items() if not placed.like]
 
     def _expendable(self) -> bool:
         """Whether all frames left out together would lessen no sigma by more than the share agreed."""

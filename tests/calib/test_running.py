@@ -104,6 +104,10 @@ def test_a_board_that_has_not_moved_is_redundant() -> None:
     now = fed(running(REDUNDANT), views(seen(poses=np.concatenate([held, held[-1:], held[-1:]]))))
     assert now.judged["008.png"].fate == now.judged["009.png"].fate == "redundant"
     assert "has not moved since 007" in now.judged["009.png"].reason
+    now.remove("007.png")
+    now.catch_up()
+    assert now.judged["008.png"].fate == "used"  # in its place
+    assert "has not moved since 008" in now.judged["009.png"].reason
 
 
 def test_a_frame_that_is_taken_away_leaves_no_trace() -> None:
