@@ -20,7 +20,7 @@ from rainstereo.calib.observations import Observations
 from rainstereo.calib.running import Running, View
 from rainstereo.calib.solve import Solution, solve
 
-TARGET_PX, SEEDS, LIMIT = 0.3, 3, 90
+TARGET_PX, SEEDS, LIMIT = 0.4, 3, 60
 QUICK_TARGET_PX = 0.6
 
 

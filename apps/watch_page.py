@@ -45,6 +45,7 @@ button{font:inherit;font-size:1rem;color:var(--dim);background:none;border:1px s
 button[aria-pressed=true]{color:var(--ink);border-color:var(--ink)}
 #mirror{position:absolute;right:.4rem;top:.4rem;background:#0a0e13cc}
 body.met{background:#04552b}body.met #figure,body.done #figure{color:var(--good)}body.met #bar i{background:var(--good)}
+body.waiting #figure,body.learning #figure{color:var(--line)}
 body.met #do .where,body.met #do .more{color:#fff}
 body.failed,body.lost{background:#4a0f14}body.failed #figure,body.lost #figure{color:#ffd0d0}
 .cell{stroke:#0a0e13;stroke-width:2}
@@ -75,6 +76,7 @@ function el(name,attributes,parent){const e=document.createElementNS(SVG,name);
 function say(node,text){if(node.textContent!==text)node.textContent=text}
 function px(v){return v===null||v===undefined?"–":v>=10?v.toFixed(0):v>=1?v.toFixed(1):v.toFixed(2)}
 function sides(text){return mirrored?text.replace(/left|right/g,w=>w==="left"?"right":"left"):text}
+function together(text){return text.replace(/(\d) (?=cm|m|px|degrees)/g,"$1\u00a0")}
 function colour(s,target){if(s===null||s===undefined)return"#1b232c";const r=s/target;
   return r<=1?"#1fa463":r<=2?"#8f9c22":r<=4?"#b3701b":"#7d3030"}
 function smooth(points){return points.map(p=>p.join(",")).join(" ")}
@@ -116,7 +118,7 @@ function words(s){
   else if(p){a=sides(p.where);b=p.how_far;c=sides(p.lean)}
   else if(!s.used&&!s.pending){a="Waiting";b="for the first pair of images"}
   else{a="Go on";b=s.trouble||"hold the board elsewhere"}
-  say(where,a);say(more,b);say(lean,c);
+  say(where,a);say(more,together(b));say(lean,together(c));
 }
 function show(s){
   state=s;

@@ -84,7 +84,7 @@ def state_of(
             trouble=trouble, proposal=None if proposal is None else _drawn(proposal),
         )  # fmt: skip
     known = running.known
-    sizes = dict(zip(ROLES, running.sizes, strict=True))
+    sizes: dict[str, tuple[int, int]] = dict(zip(ROLES, running.sizes, strict=True))
     figure = None if known is None else _finite(known.worst)
     return State(
         phase,

@@ -29,7 +29,7 @@ from rainstereo.calib.seed import usable
 from rainstereo.calib.solve import Solution, package, settle, solve
 from rainstereo.chamber import Chamber
 from rainstereo.rig import ROLES
-from rainstereo.types import Array
+from rainstereo.types import Array, Mask
 
 AUTOMATIC, SPLINED = "auto", "splined"
 PLAIN_AND_RICH = ("LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8")
@@ -185,8 +185,7 @@ class Running:
             names = self._used_names(self._adjustment)
             which = np.array([other == name for other in names])
             if which.any() and (~which).sum() >= FEWEST:
-                self._adjustment.frames = self._adjustment.frames[~which]
-                self._adjustment.problem = adjust.without(self._adjustment.problem, which)
+                self._adjustment = _without(self._adjustment, which)
                 self._unsolved += 1
             else:
                 self._forget("too few pairs are left")
@@ -286,7 +285,7 @@ class Running:
         if placed is None:
             self.judged[view.name] = Judged("rejected", "no pose of the board explains its corners")
             return
-        misfit = adjust.fit(placed)
+        misfit = _typical(placed)
         if misfit > max(MISFIT * known.noise, MISFIT_PX):
             self.judged[view.name] = Judged(
                 "rejected", f"its corners are {misfit:.1f} px from where the other frames put them: taken at different "
@@ -322,7 +321,7 @@ class Running:
             except SolveError:
                 continue
             if there.all():
-                best = min(best, (adjust.fit(placed), placed, order), key=lambda found: found[0])
+                best = min(best, (_typical(placed), placed, order), key=lambda found: found[0])
                 if best[0] < MISFIT_PX:
                     break
         return best[1], best[2]
@@ -411,6 +410,24 @@ class Running:
     @staticmethod
     def _used_names(adjustment: Adjustment) -> tuple[str, ...]:
         return tuple(adjustment.names[i] for i in adjustment.frames)
+
+
+def _typical(problem: Problem) -> float:
+    """A robust standard deviation of the residuals, pixels: some corners may be wrong."""
+    return 1.4826 * float(np.nanmedian(np.abs(versions.residuals(problem))))
+
+
+def _without(adjustment: Adjustment, which: Mask) -> Adjustment:
+    """The adjustment without some of its frames, (F,) true, which it does not know by name any longer either."""
+    kept = adjustment.frames[~which]
+    return Adjustment(
+        adjust.without(adjustment.problem, which),
+        adjustment.corners[:, kept],
+        tuple(adjustment.names[i] for i in kept),
+        np.arange(len(kept)),
+        [],
+        adjustment.reordered,
+    )
 
 
 def _no_news(share: float) -> str:

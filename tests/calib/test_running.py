@@ -185,8 +185,8 @@ def test_the_lens_model_is_the_plain_one_unless_the_rich_one_pays() -> None:
     now = fed(running(lensmodel="auto"), views(seen(8)), at_once=True)
     assert now.solution is not None
     assert now.solution.lensmodel == "LENSMODEL_OPENCV5"  # which the true lens is
-    rich = synthetic.rig(TRUE.chamber, (-0.21, 0.06, 4e-4, -3e-4, -0.3, 0.4, -0.3, 0.2))
-    observations = synthetic.observe(rich, synthetic.poses(10, 3, near=0.3), noise=0.02, seed=3)
+    rich = synthetic.rig(TRUE.chamber, (0.0, 0, 4e-4, -3e-4, 0, 0.8, 0.8, 0.0))
+    observations = synthetic.observe(rich, synthetic.poses(10, 3, near=0.3), noise=0.001, seed=3)
     now = fed(running(lensmodel="auto"), views(observations), at_once=True)
     assert now.solution is not None
     assert now.solution.lensmodel == "LENSMODEL_OPENCV8"
