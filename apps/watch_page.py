@@ -76,7 +76,7 @@ function el(name,attributes,parent){const e=document.createElementNS(SVG,name);
 function say(node,text){if(node.textContent!==text)node.textContent=text}
 function px(v){return v===null||v===undefined?"–":v>=10?v.toFixed(0):v>=1?v.toFixed(1):v.toFixed(2)}
 function sides(text){return mirrored?text.replace(/left|right/g,w=>w==="left"?"right":"left"):text}
-function together(text){return text.replace(/(\d) (?=cm|m|px|degrees)/g,"$1\u00a0")}
+function together(text){return text.replace(/([0-9]) (?=cm|m|px|degrees)/g,"$1\u00a0")}
 function colour(s,target){if(s===null||s===undefined)return"#1b232c";const r=s/target;
   return r<=1?"#1fa463":r<=2?"#8f9c22":r<=4?"#b3701b":"#7d3030"}
 function smooth(points){return points.map(p=>p.join(",")).join(" ")}
