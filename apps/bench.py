@@ -24,6 +24,7 @@ STAGES: dict[str, str] = {
     "warp": "rainstereo.apps.bench_warp",
     "calibration": "rainstereo.apps.bench_calibration",
     "cavity": "rainstereo.apps.bench_cavity",
+    "guidance": "rainstereo.apps.bench_guidance",
     "drops": "rainstereo.apps.bench_drops",
     "rain": "rainstereo.apps.bench_rain",
     "align": "rainstereo.apps.bench_align",
@@ -44,7 +45,7 @@ class Options:
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What: refraction, warp, calibration, cavity, drops, rain, align, record, select, train, derain or all."""
+    """What: refraction, warp, calibration, cavity, guidance, drops, rain, align, record, select, train, derain or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15
