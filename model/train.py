@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from rainstereo.model import checkpoint
 from rainstereo.model.augmentation import Augmentation
 from rainstereo.model.dataset import WHOLE, Batch, Rain, Sample, Steps, Windows, loader, whole
+from rainstereo.model.image_batch import INPUT
 from rainstereo.model.misalignment import misaligned
 from rainstereo.model.pair_folders import Item, find
 from rainstereo.model.recipe import Recipe, parse, plain
@@ -157,6 +158,7 @@ def card_of(run: Run) -> dict[str, Any]:
         "notes": recipe.notes or None,
         "architecture": recipe.architecture,
         "config": dataclasses.asdict(trainer.config),
+        "input": INPUT,
         "steps": trainer.done,
         "batch": recipe.optimizer.batch,
         "elapsed_s": round(run.elapsed, 3),
