@@ -233,9 +233,9 @@ def _video_work(name: str, title: str, made: Restorer, scenes: list[Image], driv
 
     variants = [Variant("each frame for itself", partial(run, 1, None), lost, True, every=3, also=also)]
     variants += [Variant("detector every 4th frame", partial(run, 4, None), lost, True, every=3, also=also)]
-    variants += [
-        Variant(f"reuse within {n} gray levels", partial(run, 1, float(n)), lost, True, also=also) for n in (4, 8, 16)
-    ]
+    for levels in (4, 8, 16):
+        again = partial(run, 1, float(levels))
+        variants.append(Variant(f"reuse within {levels} gray levels", again, lost, True, every=3, also=also))
     return Work(
         name, title,
         f"{len(drive)} frames with 1 gray level of noise, a tenth under scattered drops that stay where they are. "
