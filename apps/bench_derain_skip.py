@@ -35,7 +35,7 @@ VISIBLE = 0.15
 MANY = 4
 SECONDS = 8
 """Frames of the videos."""
-PAIRS = ((0.05, 0.3), (0.1, 0.5), (0.2, 0.6), (0.2, 0.8), (0.3, 0.8), (0.4, 0.9), (0.6, 0.9))
+PAIRS = ((0.05, 0.3), (0.1, 0.5), (0.2, 0.6), (0.3, 0.8), (0.5, 0.8), (0.5, 0.9), (0.6, 0.95))
 """Thresholds that are compared: of cells around, and of one cell at least."""
 
 

@@ -29,8 +29,8 @@ OWN = 4
 FACTORS = (1, 2, 4)
 ROWS = 180
 """Rows that the averaged image has at least, if the image has them."""
-THRESHOLD = 0.2
-CERTAIN = 0.8
+THRESHOLD = 0.5
+CERTAIN = 0.9
 MOST_BYTES = 1 << 20
 
 
