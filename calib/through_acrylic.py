@@ -1,4 +1,4 @@
-"""Calibration through known panels: the exact joint least squares, lenses, poses, board and all.
+"""Calibration through panels: the exact joint least squares, lenses, poses, board, and what is free of the panels.
 
 mrcal has no panels in its model. Starting from its solution the exact normal equations (`refracted`) are solved by
 Levenberg and Marquardt's method in mrcal's own state. At the end each corner's shift by the panels is taken off the
@@ -11,7 +11,7 @@ model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -19,7 +19,7 @@ import scipy.linalg
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib import refracted
 from rainstereo.calib.mrcal_versions import Problem
-from rainstereo.calib.refracted import ChamberError
+from rainstereo.calib.refracted import ChamberError, Panels
 from rainstereo.chamber import Chamber
 from rainstereo.types import Array
 
@@ -45,42 +45,47 @@ class Passes:
     largest_shift_px: float
 
 
-def shift(problem: Problem, chamber: Chamber) -> Array:
+def shift(problem: Problem, panels: Chamber | Panels) -> Array:
     """Pixels by which the panels move each corner at the problem's state, (M, rows, columns, 2); 0 where unseen.
 
-    chamber: in the frame of the problem's first camera. ChamberError where a corner cannot be seen through it.
+    A chamber is given in the frame of the problem's first camera. ChamberError where a corner cannot be seen through it.
     """
-    moved = refracted.pixels(problem, chamber) - refracted.bare_pixels(problem)
+    moved = refracted.pixels(problem, panels) - refracted.bare_pixels(problem)
     moved[(problem.observations[..., 2] == 0) | ~np.isfinite(moved).all(-1)] = 0
     return moved
 
 
-def refine(problem: Problem, seen: Array, chamber: Chamber, *, tolerance_px: float | None = None) -> Passes:
-    """Solve in place for corners that were seen through the chamber.
+def refine(
+    problem: Problem, seen: Array, panels: Chamber | Panels, *, tolerance_px: float | None = None
+) -> Passes:
+    """Solve in place for corners that were seen through a chamber, or through panels of which something is free.
 
     seen: (M, rows, columns, 2), the corners as detected; the problem's observations become these minus the shift.
     Its state is where the iteration starts; its weights decide which corners take part and are not changed.
     tolerance_px: done when a step moves no corner by more; by default small against the noise.
     ChamberError if that does not happen within MAX_PASSES.
     """
-    damping, change, best = DAMPING, np.inf, refracted.normal_equations(problem, seen, chamber)
+    panels = Panels.of(panels)
+    damping, change, best = DAMPING, np.inf, refracted.normal_equations(problem, seen, panels)
     taking_part = problem.observations[..., 2] > 0
     for count in range(1, MAX_PASSES + 1):
         step = _step(best, damping)
         trial = problem.copy()
-        versions.ingest(trial, best.packed + step)
-        cost = _cost(trial, seen, chamber)
+        versions.ingest(trial, best.packed + step[: len(best.packed)])
+        there = replace(panels, slab=panels.slab.moved(step[best.layout.slab]))
+        cost = _cost(trial, seen, there)
         if cost <= best.cost * (1 + 1e-12):
             change = best.widest(step)
-            versions.ingest(problem, best.packed + step)
+            versions.ingest(problem, best.packed + step[: len(best.packed)])
+            panels.slab = there.slab
             noise, gained = float(np.sqrt(cost / (2 * taking_part.sum()))), best.cost - cost
             limit = max(TOLERANCE_PX, TOLERANCE_OF_NOISE * noise) if tolerance_px is None else tolerance_px
             if change <= limit or (change < LITTLE_OF_NOISE * noise and gained < LITTLE_OF_COST * cost):
-                now = shift(problem, chamber)
+                now = shift(problem, panels)
                 problem.observations[..., :2] = seen - now
                 return Passes(count, change, float(np.linalg.norm(now[taking_part], axis=-1).max()))
             damping = max(damping * RELEASED, 1e-15)
-            best = refracted.normal_equations(problem, seen, chamber)
+            best = refracted.normal_equations(problem, seen, panels)
         else:
             damping = damping * DAMPED
             if damping > STUCK:
@@ -91,9 +96,9 @@ def refine(problem: Problem, seen: Array, chamber: Chamber, *, tolerance_px: flo
     )
 
 
-def _cost(problem: Problem, seen: Array, chamber: Chamber) -> float:
+def _cost(problem: Problem, seen: Array, panels: Panels) -> float:
     try:
-        cost = refracted.cost(problem, seen, chamber)
+        cost = refracted.cost(problem, seen, panels)
     except ChamberError:  # a step too far put a board where it cannot be
         return np.inf
     return cost if np.isfinite(cost) else np.inf
