@@ -201,7 +201,10 @@ class Linearization:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things stand in the state vector; an empty slice for what is not optimised."""
+    """Where things stand in the state vector; an empty slice for what is not optimised.
+
+    slab: the panels' parameters, which are none of mrcal's; behind its state where they are counted in.
+    """
 
     size: int
     intrinsics: tuple[slice, ...]
@@ -209,6 +212,7 @@ class Layout:
     extrinsics: slice
     frames: slice
     warp: slice
+    slab: slice = field(default_factory=lambda: slice(0, 0))
 
 
 def optimize(problem: Problem, *, outliers: bool = False) -> None:
