@@ -113,6 +113,7 @@ def covariance(solution: Solution | Problem) -> Covariance:
 
 
 def problem_of(solution: Solution | Problem) -> Problem:
+    """What mrcal solved, from a solution or given as it is."""
     return solution if isinstance(solution, Problem) else solution.problem
 
 
@@ -271,6 +272,7 @@ def _rays(pixels: Array, lensmodel: str, intrinsics: Array) -> tuple[Array, Mask
 
 
 def to_map(pixels: Array, F: Array, seen: Mask, cov: Covariance) -> UncertaintyMap:
+    """The map of a prediction with the derivative F, (M, 2, S), at those M of the grid's pixels that are `seen`."""
     moved = F @ cov.matrix
     flat, moved_flat = F.reshape(-1, cov.layout.size), moved.reshape(-1, cov.layout.size)
     mixed = moved_flat.T @ flat / max(len(F), 1)  # C FtF / N: the trace of its square is that of (F C Ft)^2 / N^2
