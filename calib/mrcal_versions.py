@@ -203,7 +203,8 @@ class Linearization:
 class Layout:
     """Where things stand in the state vector; an empty slice for what is not optimised.
 
-    slab: the panels' parameters, which are none of mrcal's; behind its state where they are counted in.
+    slab: the parameters of the panels (`slab.Slab.names` in this order), which follow mrcal's state; mrcal's own
+    functions know nothing of them. size counts them.
     """
 
     size: int
@@ -213,6 +214,11 @@ class Layout:
     frames: slice
     warp: slice
     slab: slice = field(default_factory=lambda: slice(0, 0))
+
+    def with_slab(self, count: int) -> Layout:
+        """The same with `count` parameters of the panels behind mrcal's state, in place of those there were."""
+        size = self.size - (self.slab.stop - self.slab.start)
+        return replace(self, size=size + count, slab=slice(size, size + count) if count else slice(0, 0))
 
 
 def optimize(problem: Problem, *, outliers: bool = False) -> None:

@@ -40,6 +40,11 @@ Gauge = Literal["boards", "image"]
 class Covariance:
     """Covariance of everything a solution estimated, (S, S) in SI units and pixels, as `layout` lays it out.
 
+    First comes mrcal's state, then, in `layout.slab`, the panels' parameters as `slab.Slab.names` lists them (angles of
+    the common normal in radians, metres of each material, indices, wedge in radians); none where nothing is
+    uncertain about the panels, or there are none. Rows and columns between the two say how lenses, poses and boards
+    move with the panels.
+
     sigma: standard deviation of a corner's coordinate, pixels, from residuals and degrees of freedom.
     condition: of the scaled normal equations; beyond 1e14 something is not determined by the data at all.
     """
