@@ -37,7 +37,8 @@ def projection_uncertainty(
     cov = uncertainty.covariance(solution) if cov is None else cov
     if np.isinf(distance):
         return uncertainty.infinity_uncertainty(solution, role, grid, gauge=gauge, cov=cov)
-    problem, slab = solution.problem, _slab(solution, slab)
+    problem = solution.problem
+    slab = sensitivity.panels(solution) if slab is None else slab
     pixels = uncertainty.image_grid(problem.sizes[ROLES.index(role)], grid)
     points, shown = sensitivity.along(problem, slab, role, pixels.reshape(-1, 2), _checked(distance))
     seen = sensitivity.view(problem, cov.layout, slab, role, points)
@@ -76,14 +77,11 @@ def stereo_gradient(
 
     (M, 2, S) for those that have an answer, and which these are, (N,).
     """
-    problem, slab = solution.problem, _slab(solution, slab)
+    problem = solution.problem
+    slab = sensitivity.panels(solution) if slab is None else slab
     points, shown = sensitivity.along(problem, slab, "dry", pixels, _checked(distance))
     dry, wet = (sensitivity.view(problem, cov.layout, slab, role, points) for role in ROLES)
     return wet.by_state + wet.by_point @ sensitivity.by_dry_pixel(dry, points), shown
-
-
-def _slab(solution: Solution, slab: Slab | None) -> Slab | None:
-    return Slab.exact(solution.rig.chamber) if slab is None and solution.rig.chamber is not None else slab
 
 
 def _checked(distance: float) -> float:

@@ -14,6 +14,7 @@ from rainstereo import pose, refraction
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.mrcal_versions import Layout, Problem
 from rainstereo.calib.rotation import rotated_by
+from rainstereo.calib.solve import Solution
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
 from rainstereo.rig import ROLES, Role
@@ -51,6 +52,11 @@ class View:
     by_ray: Array
     by_point: Array
     by_state: Array
+
+
+def panels(solution: Solution) -> Slab | None:
+    """The solution's panels, taken as exact; None where there are none."""
+    return None if solution.rig.chamber is None else Slab.exact(solution.rig.chamber)
 
 
 def view(problem: Problem, layout: Layout, slab: Slab | None, role: Role, points: Array) -> View:
