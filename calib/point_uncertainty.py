@@ -1,8 +1,8 @@
 """How well a point is known that two pixels show: noise of these pixels, and everything calibrated, panels included.
 
-The point P minimises |q(P, b) - q|^2 over both images (`rainstereo.triangulation`), with J the derivative of the images
-q(P, b) by the point and B that by the calibration b. To first order P moves by J+ dq with the pixels and by -J+ B db with
-the calibration, J+ the pseudoinverse (Hartley and Zisserman, "Multiple View Geometry", 2004, section 5.2.3).
+The point P minimises |q(P, b) - q|^2 over both images (`rainstereo.triangulation`). With J the derivative of the images
+q(P, b) by the point and B that by the calibration b, P moves, to first order, by J+ dq with the pixels and by
+-J+ B db with the calibration (J+ the pseudoinverse; Hartley and Zisserman, "Multiple View Geometry", 2004, section 5.2.3).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from rainstereo import pose, refraction, types
 from rainstereo.calib import sensitivity, uncertainty
-from rainstereo.calib.sensitivity import Slab
+from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution
 from rainstereo.calib.uncertainty import Covariance
 from rainstereo.rig import ROLES

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from rainstereo.calib import sensitivity, uncertainty
-from rainstereo.calib.sensitivity import Slab
+from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution
 from rainstereo.calib.uncertainty import GRID, Covariance, Gauge, UncertaintyMap
 from rainstereo.rig import ROLES, Role

@@ -12,32 +12,15 @@ import numpy as np
 
 from rainstereo import pose, refraction
 from rainstereo.calib import mrcal_versions as versions
+from rainstereo.calib import slab as slabs
 from rainstereo.calib.mrcal_versions import Layout, Problem
 from rainstereo.calib.rotation import rotated_by
+from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution
+from rainstereo.calib.uncertainty import Covariance
 from rainstereo.camera import Camera
-from rainstereo.chamber import Chamber
 from rainstereo.rig import ROLES, Role
 from rainstereo.types import Array, Mask
-
-
-@dataclass(frozen=True, eq=False)
-class Slab:
-    """The panels, in the reference frame, and how they depend on K parameters.
-
-    normal: (3, K), across the normal. thickness: (P, K). index: (P, K), P panels.
-    """
-
-    chamber: Chamber
-    normal: Array
-    thickness: Array
-    index: Array
-
-    @classmethod
-    def exact(cls, chamber: Chamber) -> Slab:
-        """Panels that are known exactly: no parameters."""
-        count = len(chamber.panels)
-        return cls(chamber, np.zeros((3, 0)), np.zeros((count, 0)), np.zeros((count, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +37,11 @@ class View:
     by_state: Array
 
 
-def panels(solution: Solution) -> Slab | None:
-    """The solution's panels, taken as exact; None where there are none."""
-    return None if solution.rig.chamber is None else Slab.exact(solution.rig.chamber)
+def panels(solution: Solution, cov: Covariance | None = None) -> Slab | None:
+    """The solution's panels with the parameters that a covariance counts; None where there are no panels."""
+    if solution.rig.chamber is None:
+        return None
+    return Slab(solution.rig.chamber)
 
 
 def view(problem: Problem, layout: Layout, slab: Slab | None, role: Role, points: Array) -> View:
@@ -64,27 +49,20 @@ def view(problem: Problem, layout: Layout, slab: Slab | None, role: Role, points
     index = ROLES.index(role)
     rt = np.zeros(6) if index == 0 else problem.rt_cam_ref[index - 1]
     R, intrinsics = pose.rotation_matrix(rt[:3]), problem.intrinsics[index]
-    in_camera = pose.transform(rt, points)
+    u = points + R.T @ rt[3:]
     by_state = np.zeros((len(points), 2, layout.size))
-    if slab is None:
-        apparent, bent, by_slab = in_camera, np.broadcast_to(np.eye(3), (len(points), 3, 3)), None
-    else:
-        inside = slab.chamber.transformed(rt)
-        apparent, bent, _ = refraction.apparent_jacobian(in_camera, inside)
-        lens = Camera(problem.lensmodel, intrinsics, *problem.sizes[index].tolist())
-        by_slab = refraction.jacobian(in_camera, lens, inside)
+    bent = None if slab is None else slabs.view(slab, u, -R.T @ rt[3:])
+    apparent = (u if bent is None else bent.seen) @ R.T
     _, by_apparent, by_lens = versions.project_gradients(apparent, problem.lensmodel, intrinsics)
-    by_point = by_apparent @ bent @ R
+    by_point = by_apparent @ R if bent is None else by_apparent @ R @ bent.point
     by_state[..., layout.intrinsics[index]] = by_lens[..., layout.intrinsics_columns]
     if index and layout.extrinsics.stop:
         start = layout.extrinsics.start + 6 * (index - 1)
         around = by_apparent @ rotated_by(rt[:3], apparent @ R) - by_point @ rotated_by(-rt[:3], rt[3:])
         by_state[..., start : start + 3] = around
         by_state[..., start + 3 : start + 6] = by_point @ R.T
-    if slab is not None and by_slab is not None:
-        by_state[..., layout.slab] = (
-            by_slab.normal @ R @ slab.normal + by_slab.thickness @ slab.thickness + by_slab.index @ slab.index
-        )
+    if bent is not None:
+        by_state[..., layout.slab] = by_apparent @ R @ bent.parameters
     length = np.linalg.norm(apparent, axis=-1)
     return View(apparent / length[:, None], by_apparent * length[:, None, None], by_point, by_state)
 

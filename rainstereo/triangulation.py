@@ -185,9 +185,9 @@ def image_and_gradient(points: Array, camera: Camera, chamber: Chamber | None) -
     """Pixels, (N, 2), of points in the camera's frame, (N, 3), and their derivative by the point, (N, 2, 3)."""
     if chamber is None:
         return camera.project_jacobian(points)
-    apparent, moved, _ = refraction.apparent_jacobian(points, chamber)
-    pixels, by_apparent = camera.project_jacobian(apparent)
-    return pixels, np.asarray(by_apparent @ moved)
+    bent = refraction.apparent_gradients(points, chamber)
+    pixels, by_apparent = camera.project_jacobian(bent.seen)
+    return pixels, np.asarray(by_apparent @ bent.point)
 
 
 def _factored(J: Array) -> tuple[Array, Array, types.Mask]:

@@ -1,4 +1,4 @@
-"""Covariance of triangulated points: against differences, against mrcal's own, against OpenCV's geometry in its limits."""
+"""Covariance of triangulated points: against differences, against mrcal's own, and in its limits."""
 
 from pathlib import Path
 
@@ -57,7 +57,9 @@ def test_points_without_panels_are_mrcals(bare: Solution, tmp_path: Path) -> Non
     np.testing.assert_allclose(ours.points, theirs, rtol=1e-7)
     count = range(len(POINTS))
     np.testing.assert_allclose(ours.from_calibration, calibration[count, :, count], rtol=1e-2, atol=1e-11)
-    np.testing.assert_allclose(ours.from_pixels[:, 2, 2], noise[count, 2, count, 2] if noise.ndim == 4 else noise[:, 2, 2], rtol=1e-2)
+    np.testing.assert_allclose(
+        ours.from_pixels[:, 2, 2], noise[count, 2, count, 2] if noise.ndim == 4 else noise[:, 2, 2], rtol=1e-2
+    )
 
 
 def test_derivative_by_the_calibration(through: Solution) -> None:

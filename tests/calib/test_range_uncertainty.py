@@ -11,7 +11,7 @@ pytest.importorskip("mrcal", reason="mrcal is not installed")
 from rainstereo import Camera, Chamber, Panel, Rig, pose, refraction
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib import range_uncertainty, sensitivity, uncertainty
-from rainstereo.calib.sensitivity import Slab
+from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution, solve
 from rainstereo.calib.uncertainty import Covariance
 from rainstereo.rig import ROLES, Role
@@ -95,37 +95,19 @@ def test_stereo_derivative_against_differences(through: Solution, distance: floa
     assert not F[..., layout.frames].any()  # no board has a say in it
 
 
-def free_slab(chamber: Chamber) -> Slab:
-    """Two tilts, both thicknesses, one index for both panels: five parameters."""
-    across = np.linalg.svd(np.array([chamber.normal]))[2][1:]
-    normal, thickness, index = np.zeros((3, 5)), np.zeros((2, 5)), np.zeros((2, 5))
-    normal[:, :2], thickness[0, 2], thickness[1, 3], index[:, 4] = across.T, 1, 1, 1
-    return Slab(chamber, normal, thickness, index)
-
-
-def moved(slab: Slab, step: Array) -> Chamber:
-    inside = slab.chamber
-    panels = tuple(
-        Panel(p.thickness + t, p.index + n)
-        for p, t, n in zip(inside.panels, slab.thickness @ step, slab.index @ step, strict=True)
-    )
-    return Chamber(tuple(np.array(inside.normal) + slab.normal @ step), inside.distance, panels, inside.gaps)
-
-
 def extended(cov: Covariance, count: int) -> Covariance:
-    size = cov.layout.size
-    layout = replace(cov.layout, size=size + count, slab=slice(size, size + count))
-    return replace(cov, matrix=np.pad(cov.matrix, (0, count)), layout=layout)
+    return replace(cov, matrix=np.pad(cov.matrix, (0, count)), layout=cov.layout.with_slab(count))
 
 
 def test_slab_derivatives_against_differences(through: Solution) -> None:
-    slab = free_slab(INSIDE)
-    cov = extended(uncertainty.covariance(through), 5)
+    slab = Slab(INSIDE, ("tilt", "thickness", "index"))
+    count = len(slab.names)
+    cov = extended(uncertainty.covariance(through), count)
     dry = uncertainty.image_grid(np.array(synthetic.SIZE), (3, 2)).reshape(-1, 2)
     F, _ = range_uncertainty.stereo_gradient(through, dry, 0.5, cov, slab)
-    for k in range(5):
-        step = 1e-6 * np.eye(5)[k]
-        up, down = (stereo_pixels(rig_of(through.problem, moved(slab, s)), dry, 0.5) for s in (step, -step))
+    for k in range(count):
+        step = 1e-6 * np.eye(count)[k]
+        up, down = (stereo_pixels(rig_of(through.problem, slab.moved(s).chamber), dry, 0.5) for s in (step, -step))
         scale = np.abs(F[..., cov.layout.slab][..., k]).max()
         numeric = (up - down) / 2e-6
         np.testing.assert_allclose(F[..., cov.layout.slab][..., k] / scale, numeric / scale, atol=1e-5)
@@ -135,7 +117,7 @@ def test_slab_derivatives_against_differences(through: Solution) -> None:
 def test_a_camera_and_its_boards_against_differences(through: Solution, role: Role) -> None:
     """Gauge "boards": points are carried by the mean of the boards while everything else changes."""
     cov, problem, index = uncertainty.covariance(through), through.problem, ROLES.index(role)
-    slab = Slab.exact(INSIDE)
+    slab = Slab(INSIDE)
     pixels = uncertainty.image_grid(np.array(synthetic.SIZE), (3, 2)).reshape(-1, 2)
     points, _ = sensitivity.along(problem, slab, role, pixels, 0.5)
     seen = sensitivity.view(problem, cov.layout, slab, role, points)
@@ -179,7 +161,7 @@ def test_far_away_is_infinity(through: Solution, gauge: uncertainty.Gauge) -> No
 
 def test_a_slab_of_no_thickness_is_none(bare: Solution) -> None:
     cov = uncertainty.covariance(bare)
-    nothing = Slab.exact(Chamber((0, 0.2, 1), 0.04, (Panel(0.0, 1.49),)))
+    nothing = Slab(Chamber((0, 0.2, 1), 0.04, (Panel(0.0, 1.49),)))
     for distance in (0.3, 2.0):
         np.testing.assert_allclose(
             range_uncertainty.stereo_uncertainty(bare, distance, (4, 3), cov=cov, slab=nothing).covariance,
