@@ -104,7 +104,7 @@ def _rows(
     views, count = len(frames), apparent[0].size // 3
     seen, by_point, by_lens = versions.project_gradients(apparent, problem.lensmodel, problem.intrinsics[camera])
     by_centred = by_point @ R  # a turned, derivative by a
-    _, moved, _ = refraction.apparent_jacobian(u.reshape(-1, 3), _centred(chamber, -R.T @ rt[3:]))
+    moved = refraction.apparent_gradients(u.reshape(-1, 3), _centred(chamber, -R.T @ rt[3:])).point
     moved = moved.reshape(*u.shape, 3)
     by_reference = (by_centred @ moved).reshape(views, count, 2, 3)
     parts: list[Array] = [by_lens[..., layout.intrinsics_columns].reshape(views, count, 2, -1)]
