@@ -1,8 +1,8 @@
 """How well a point is known that two pixels show: noise of these pixels, and everything calibrated, panels included.
 
 The point P minimises |q(P, b) - q|^2 over both images (`rainstereo.triangulation`). With J the derivative of the images
-q(P, b) by the point and B that by the calibration b, P moves, to first order, by J+ dq with the pixels and by
--J+ B db with the calibration (J+ the pseudoinverse; Hartley and Zisserman, "Multiple View Geometry", 2004, section 5.2.3).
+q(P, b) by the point and B that by the calibration b, P moves, to first order, by J+ dq with the pixels and by -J+ B db
+with the calibration (J+ the pseudoinverse; Hartley and Zisserman, "Multiple View Geometry", 2004, section 5.2.3).
 """
 
 from __future__ import annotations

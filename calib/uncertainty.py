@@ -107,7 +107,7 @@ def covariance(solution: Solution | Problem) -> Covariance:
     rows = linear.jacobian[: linear.boards]
     normal = (linear.jacobian.T @ linear.jacobian).toarray()
     corners = (rows.T @ rows).toarray()
-    inverse, condition = _inverse(normal)
+    inverse, condition = regular_inverse(normal)
     packed = inverse @ corners @ inverse
     inliers = int(2 * (problem.observations[..., 2] > 0).sum())
     freedom = inliers - float(np.sum(inverse * corners))  # the trace of the hat matrix: parameters really spent
@@ -122,7 +122,7 @@ def problem_of(solution: Solution | Problem) -> Problem:
     return solution if isinstance(solution, Problem) else solution.problem
 
 
-def _inverse(normal: Array) -> tuple[Array, float]:
+def regular_inverse(normal: Array) -> tuple[Array, float]:
     """Inverse of a symmetric positive matrix and its condition after scaling its diagonal to one.
 
     Directions that are not determined get a large finite variance, so that what does not depend on them stays known.
