@@ -213,7 +213,7 @@ class Layout:
     extrinsics: slice
     frames: slice
     warp: slice
-    slab: slice = slice(0, 0)
+    slab: slice = field(default_factory=lambda: slice(0, 0))
 
     def with_slab(self, count: int) -> Layout:
         """The same with `count` parameters of the panels behind mrcal's state, in place of those there were."""

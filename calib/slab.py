@@ -114,7 +114,9 @@ class Slab:
         for m in range(self.count):
             mine = materials == m
             if not weight[mine].any():
-                weight[mine] = [p.thickness if np.isfinite(p.thickness) else 0.0 for p in np.array(panels, object)[mine]]
+                weight[mine] = [
+                    p.thickness if np.isfinite(p.thickness) else 0.0 for p in np.array(panels, object)[mine]
+                ]
             if not weight[mine].any():
                 weight[mine] = 1.0
             weight[mine] /= weight[mine].sum()
@@ -157,9 +159,10 @@ class Slab:
 
     def limited(self) -> tuple[Mask, Mask]:
         """Which parameters stand at the lower and at the upper end of their range, (P,) each."""
-        low = [self.thickness(m) <= THICKNESS_RANGE[0] for m in self.thick], [
-            self.index(m) <= INDEX_RANGE[0] for m in range(self.count)
-        ]
+        low = (
+            [self.thickness(m) <= THICKNESS_RANGE[0] for m in self.thick],
+            [self.index(m) <= INDEX_RANGE[0] for m in range(self.count)],
+        )
         high = [False] * len(self.thick), [self.index(m) >= INDEX_RANGE[1] for m in range(self.count)]
         ends = []
         for thickness, index in (low, high):
