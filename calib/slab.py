@@ -92,7 +92,7 @@ class Slab:
         of_kind: dict[Kind, list[float]] = {
             "tilt": [float(np.arctan2(y, np.hypot(x, z))), float(np.arctan2(x, z))],
             "thickness": [self.thickness(m) for m in self.thick],
-            "index": [self._index(m) for m in range(self.count)],
+            "index": [self.index(m) for m in range(self.count)],
             "wedge": (np.asarray(self.wedge) @ axes).tolist(),
         }
         return np.array([value for kind in self.free for value in of_kind[kind]])
@@ -102,7 +102,8 @@ class Slab:
         panels = zip(self.materials, self.chamber.panels, strict=True)
         return float(sum(panel.thickness for m, panel in panels if m == material))
 
-    def _index(self, material: int) -> float:
+    def index(self, material: int) -> float:
+        """Of a material."""
         return self.chamber.panels[self.materials.index(material)].index
 
     def shares(self) -> Array:
@@ -113,7 +114,9 @@ class Slab:
         for m in range(self.count):
             mine = materials == m
             if not weight[mine].any():
-                weight[mine] = [p.thickness if np.isfinite(p.thickness) else 0.0 for p in np.array(panels, object)[mine]]
+                weight[mine] = [
+                    p.thickness if np.isfinite(p.thickness) else 0.0 for p in np.array(panels, object)[mine]
+                ]
             if not weight[mine].any():
                 weight[mine] = 1.0
             weight[mine] /= weight[mine].sum()
@@ -156,10 +159,11 @@ class Slab:
 
     def limited(self) -> tuple[Mask, Mask]:
         """Which parameters stand at the lower and at the upper end of their range, (P,) each."""
-        low = [self.thickness(m) <= THICKNESS_RANGE[0] for m in self.thick], [
-            self._index(m) <= INDEX_RANGE[0] for m in range(self.count)
-        ]
-        high = [False] * len(self.thick), [self._index(m) >= INDEX_RANGE[1] for m in range(self.count)]
+        low = (
+            [self.thickness(m) <= THICKNESS_RANGE[0] for m in self.thick],
+            [self.index(m) <= INDEX_RANGE[0] for m in range(self.count)],
+        )
+        high = [False] * len(self.thick), [self.index(m) >= INDEX_RANGE[1] for m in range(self.count)]
         ends = []
         for thickness, index in (low, high):
             of_kind: dict[Kind, list[bool]] = {

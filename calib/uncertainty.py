@@ -102,12 +102,12 @@ class UncertaintyMap:
 
 def covariance(solution: Solution | Problem) -> Covariance:
     """Covariance of the solution's state, from its residuals and mrcal's Jacobian."""
-    problem = _problem(solution)
+    problem = problem_of(solution)
     linear = versions.linearize(problem)
     rows = linear.jacobian[: linear.boards]
     normal = (linear.jacobian.T @ linear.jacobian).toarray()
     corners = (rows.T @ rows).toarray()
-    inverse, condition = _inverse(normal)
+    inverse, condition = regular_inverse(normal)
     packed = inverse @ corners @ inverse
     inliers = int(2 * (problem.observations[..., 2] > 0).sum())
     freedom = inliers - float(np.sum(inverse * corners))  # the trace of the hat matrix: parameters really spent
@@ -117,11 +117,12 @@ def covariance(solution: Solution | Problem) -> Covariance:
     return Covariance((matrix + matrix.T) / 2, versions.layout(problem), sigma, condition)
 
 
-def _problem(solution: Solution | Problem) -> Problem:
+def problem_of(solution: Solution | Problem) -> Problem:
+    """What mrcal solved, from a solution or given as it is."""
     return solution if isinstance(solution, Problem) else solution.problem
 
 
-def _inverse(normal: Array) -> tuple[Array, float]:
+def regular_inverse(normal: Array) -> tuple[Array, float]:
     """Inverse of a symmetric positive matrix and its condition after scaling its diagonal to one.
 
     Directions that are not determined get a large finite variance, so that what does not depend on them stays known.
@@ -137,7 +138,7 @@ def baseline_sigma(solution: Solution | Problem, cov: Covariance | None = None) 
     """Standard deviation of the baseline, metres; the board's squares are taken as exact."""
     cov = covariance(solution) if cov is None else cov
     span = slice(cov.layout.extrinsics.start + 3, cov.layout.extrinsics.start + 6)
-    t = _problem(solution).rt_cam_ref[0, 3:]
+    t = problem_of(solution).rt_cam_ref[0, 3:]
     return float(np.sqrt(t @ cov.matrix[span, span] @ t) / np.linalg.norm(t))
 
 
@@ -154,7 +155,7 @@ def infinity_uncertainty(
     gauge: "boards" as mrcal has it, "image" for what is left after the best-fitting rotation.
     """
     cov = covariance(solution) if cov is None else cov
-    problem, index = _problem(solution), ROLES.index(role)
+    problem, index = problem_of(solution), ROLES.index(role)
     pixels = image_grid(problem.sizes[index], grid)
     lens = problem.lensmodel, problem.intrinsics[index]
     rays, seen = _rays(pixels, *lens)
@@ -164,8 +165,8 @@ def infinity_uncertainty(
     if gauge == "boards":
         _through_boards(F, rays, by_ray, problem, index, cov.layout)
     else:
-        F += by_ray @ _best_rotation(rays, by_ray, F)
-    return _map(pixels, F, seen, cov)
+        F += by_ray @ best_rotation(rays, by_ray, F)
+    return to_map(pixels, F, seen, cov)
 
 
 def stereo_infinity_uncertainty(
@@ -176,7 +177,7 @@ def stereo_infinity_uncertainty(
     On a grid of (columns, rows) dry pixels. This is the error that stays in aligned pairs of far scenes.
     """
     cov = covariance(solution) if cov is None else cov
-    problem, layout = _problem(solution), cov.layout
+    problem, layout = problem_of(solution), cov.layout
     pixels = image_grid(problem.sizes[0], grid)
     rays, seen = _rays(pixels, problem.lensmodel, problem.intrinsics[0])
     _, by_ray, by_lens = versions.project_gradients(rays, problem.lensmodel, problem.intrinsics[0])
@@ -189,7 +190,7 @@ def stereo_infinity_uncertainty(
     ]
     F[..., layout.intrinsics[1]] = wet_by_lens[..., layout.intrinsics_columns]
     F[..., _rotation(layout.extrinsics, 0)] = wet_by_ray @ rotated_by(r, rays)
-    return _map(pixels, F, seen, cov)
+    return to_map(pixels, F, seen, cov)
 
 
 @dataclass(frozen=True)
@@ -253,7 +254,7 @@ def _through_boards(F: Array, rays: Array, by_ray: Array, problem: Problem, inde
         F[..., _rotation(layout.frames, frame)] = by_ray @ R @ moved / len(boards)
 
 
-def _best_rotation(rays: Array, by_ray: Array, F: Array) -> Array:
+def best_rotation(rays: Array, by_ray: Array, F: Array) -> Array:
     """How the rays move, (N, 3, S), under the rotation that best undoes what F does to the image."""
     moved = -_tangent_inverse(by_ray) @ F
     K = cross_matrix(rays)  # w x v = -[v]x w: the least-squares w of sum |dv - w x v|^2
@@ -275,7 +276,8 @@ def _rays(pixels: Array, lensmodel: str, intrinsics: Array) -> tuple[Array, Mask
     return rays[seen], seen
 
 
-def _map(pixels: Array, F: Array, seen: Mask, cov: Covariance) -> UncertaintyMap:
+def to_map(pixels: Array, F: Array, seen: Mask, cov: Covariance) -> UncertaintyMap:
+    """The map of a prediction with the derivative F, (M, 2, S), at those M of the grid's pixels that are `seen`."""
     moved = F @ cov.matrix
     flat, moved_flat = F.reshape(-1, cov.layout.size), moved.reshape(-1, cov.layout.size)
     mixed = moved_flat.T @ flat / max(len(F), 1)  # C FtF / N: the trace of its square is that of (F C Ft)^2 / N^2

@@ -1,0 +1,117 @@
+"""Pictures of how far a calibration can be trusted: maps side by side, what the uncertainty is made of, depth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from rainstereo.apps.canvas import FAINT, INK, RAIN, SERIES, image_axes, sheet, styled
+from rainstereo.apps.figures import ladder, same_length
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@styled
+def map_rows(
+    rows: Mapping[str, Sequence[npt.ArrayLike]],
+    columns: Sequence[str],
+    size: tuple[int, int],
+    unit: str,
+    top: float | None = None,
+) -> Figure:
+    """Scalars over the image plane, one row of maps for each name, all in one colour scale.
+
+    rows : name -> maps (H, W), one for each of `columns`, on grids whose first and last samples lie on the image's
+    outermost pixel centres; NaN = unknown. top : the value at which the colour ends (98th percentile by default).
+    """
+    for name, maps in rows.items():
+        same_length("columns", columns, name, maps)
+    known = np.concatenate([np.asarray(m, float).ravel() for maps in rows.values() for m in maps] or [np.zeros(0)])
+    known = known[np.isfinite(known)]
+    top = (float(np.percentile(known, 98)) if known.size else 1.0) if top is None else top
+    top = top if top > 0 else 1.0
+    width, height = size
+    each = 9.2 / len(columns)
+    figure, grid = sheet(9.2, len(rows) * (0.82 * each * height / width + 0.42), len(rows), len(columns), squeeze=False)
+    mesh = None
+    for line, (name, maps) in zip(grid, rows.items(), strict=True):
+        for axes, values, title in zip(line, maps, columns, strict=True):
+            field = np.asarray(values, float)
+            x, y = np.linspace(0, width - 1, field.shape[1]), np.linspace(0, height - 1, field.shape[0])
+            mesh = axes.pcolormesh(x, y, field, cmap=RAIN, vmin=0, vmax=top, shading="gouraud")
+            mesh.set_rasterized(True)
+            seen = field[np.isfinite(field)]
+            levels = ladder(float(seen.min()), top)[-4:] if seen.size and np.ptp(seen) > 0 else []
+            if levels:
+                drawn = axes.contour(x, y, field, levels=levels, colors="#0b1a29", linewidths=0.6)
+                axes.clabel(drawn, fmt=lambda v: f"{v:g}", fontsize=7)
+            image_axes(axes, size)
+            axes.grid(False)
+            axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+            middle = f", median {np.median(seen):.2g}" if seen.size else ", no answer"
+            axes.set_title(f"{name}, {title}{middle}" if name else f"{title}{middle}", fontsize=9)
+    if mesh is not None:
+        bar = figure.colorbar(
+            mesh, ax=grid, label=unit, shrink=min(1.0, 1.4 / len(rows)), pad=0.01, aspect=30,
+            extend="max" if known.max(initial=0) > top else "neither",
+        )  # fmt: skip
+        bar.outline.set_visible(False)
+    return figure
+
+
+@styled
+def shares(labels: Sequence[str], parts: Mapping[str, npt.ArrayLike], totals: Sequence[str]) -> Figure:
+    """What each variance is made of: one bar for each label, cut into the parts' shares; its total is written beside.
+
+    parts : name -> (N,) variances, 0 or more.
+    """
+    same_length("labels", labels, "totals", totals)
+    stack = np.stack([np.asarray(values, float).reshape(-1) for values in parts.values()])
+    same_length("labels", labels, "each of parts", stack[0])
+    share = stack / np.where(stack.sum(0) > 0, stack.sum(0), 1)
+    figure, axes = sheet(8.4, 0.42 * len(labels) + 1.0)
+    place, left = np.arange(len(labels)), np.zeros(len(labels))
+    for name, values, colour in zip(parts, share, SERIES, strict=False):
+        axes.barh(place, 100 * values, left=100 * left, height=0.66, color=colour, label=name)
+        for i, value in enumerate(values):
+            if value > 0.06:
+                axes.text(100 * (left[i] + value / 2), i, f"{100 * value:.0f} %", ha="center", va="center",
+                          color="white", fontsize=8.5)  # fmt: skip
+        left += values
+    for i, total in enumerate(totals):
+        axes.annotate(total, (100, i), (6, 0), textcoords="offset points", va="center", color=INK, fontsize=9)
+    axes.set_yticks(place, list(labels))
+    axes.set(xlim=(0, 118), ylim=(len(labels) - 0.5, -0.5), xlabel="share of the variance, %")
+    axes.set_xticks([0, 25, 50, 75, 100])
+    axes.grid(axis="y", visible=False)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=len(parts), borderaxespad=0.2)
+    return figure
+
+
+@styled
+def depth_sigmas(depths: npt.ArrayLike, sigmas: Mapping[str, npt.ArrayLike]) -> Figure:
+    """Standard deviation of depth against depth, both in metres, on logarithmic axes; the first curve is the thick one.
+
+    depths : (N,). sigmas : name -> (N,), curves that are zero throughout are left out.
+    """
+    z = np.asarray(depths, float)
+    figure, axes = sheet(8.4, 3.4)
+    for i, (name, values) in enumerate(sigmas.items()):
+        curve = 1000 * np.asarray(values, float)
+        same_length("depths", z, name, curve)
+        if np.nanmax(curve, initial=0) > 0:
+            colour = INK if i == 0 else SERIES[(i - 1) % len(SERIES)]
+            axes.loglog(z, np.where(curve > 0, curve, np.nan), color=colour, lw=2.4 if i == 0 else 1.4, label=name)
+    axes.set(xlabel="depth, m", ylabel="one sigma of depth, mm")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda v, _: f"{v:g}")
+        axis.set_minor_formatter(lambda _, __: "")
+    axes.set_xticks([v for v in (0.2, 0.5, 1, 2, 5, 10, 20, 50) if z.min() <= v <= z.max()])
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1), borderaxespad=0)
+    axes.tick_params(which="minor", length=0)
+    axes.annotate("in the middle of the dry image", (0, 1), (0, 5), "axes fraction", textcoords="offset points",
+                  color=FAINT, fontsize=8.5)  # fmt: skip
+    return figure
