@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rainstereo.calib import refracted, through_acrylic, uncertainty
+from rainstereo.calib import refracted, through_acrylic
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.mrcal_versions import Problem
 from rainstereo.calib.prior import Prior
 from rainstereo.calib.refracted import Normal, Panels
 from rainstereo.calib.slab import Slab
-from rainstereo.calib.uncertainty import Covariance
+from rainstereo.calib.state_covariance import Covariance, regular_inverse
 from rainstereo.chamber import SD_LIMITS, Chamber, ChamberUncertainty
 from rainstereo.types import Array, Mask
 
@@ -146,7 +146,7 @@ def _covariance(problem: Problem, normal: Normal, panels: Panels) -> tuple[Covar
     Var = A M A sigma^2 with A the inverse of all of J'J and M its part that carries noise: all but mrcal's
     regularization (see `uncertainty`). The prior's rows do carry it.
     """
-    inverse, condition = uncertainty.regular_inverse(normal.matrix)
+    inverse, condition = regular_inverse(normal.matrix)
     noisy = normal.matrix - normal.held
     corners, at = noisy.copy(), versions.linearize(problem)
     square = normal.cost - float(np.sum(at.residuals[at.boards :] ** 2))
