@@ -18,6 +18,7 @@ import numpy as np
 from rainstereo import pose, refraction
 from rainstereo.calib import adjust, range_uncertainty, through_acrylic, uncertainty
 from rainstereo.calib import mrcal_versions as versions
+from rainstereo.calib.checks import Finding
 from rainstereo.calib.mrcal_versions import Problem, SolveError
 from rainstereo.calib.solve import Solution
 from rainstereo.camera import Camera
@@ -30,6 +31,12 @@ GRID = (16, 12)
 FEWEST = 4
 """Frames that a part must have to be calibrated at all."""
 BANDS = ("nearest", "middle", "farthest")
+DOUBTFUL_RATIO, DOUBTFUL_PX = 2.0, 0.03
+"""Noise alone seldom differs by twice what it should, and what is smaller than this harms nobody."""
+REMEDY = (
+    "something is not as the model has it: check that the panels are given and their figures right, that the board is "
+    "flat and held still, and that nothing is loose"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +102,22 @@ def compare(
         span = f"{far[band].min():.2f} to {far[band].max():.2f} m" if len(band) else "none"
         comparisons.append(_without(solution, left_out, f"without the {name} boards ({span})", distances, grid))
     return tuple(comparisons)
+
+
+def doubts(comparisons: Sequence[Comparison]) -> list[Finding]:
+    """Where parts of a capture differ by more than DOUBTFUL_RATIO of what noise explains, and by DOUBTFUL_PX."""
+    found = []
+    for each in comparisons:
+        beyond = [d for d in each.differences if d.ratio > DOUBTFUL_RATIO and d.rms > DOUBTFUL_PX]
+        if beyond:
+            worst = max(beyond, key=lambda d: d.ratio)
+            where = "at infinity" if np.isinf(worst.distance) else f"at {worst.distance:g} m"
+            text = (
+                f"{each.name}: the wet pixel that belongs to a dry pixel {where} differs by {worst.rms:.2f} px, "
+                f"{worst.ratio:.1f} times what noise of the corners explains"
+            )
+            found.append(Finding("doubtful", text, REMEDY))
+    return found
 
 
 def part(solution: Solution, kept: Mask) -> Solution:
