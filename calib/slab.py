@@ -92,7 +92,7 @@ class Slab:
         of_kind: dict[Kind, list[float]] = {
             "tilt": [float(np.arctan2(y, np.hypot(x, z))), float(np.arctan2(x, z))],
             "thickness": [self.thickness(m) for m in self.thick],
-            "index": [self._index(m) for m in range(self.count)],
+            "index": [self.index(m) for m in range(self.count)],
             "wedge": (np.asarray(self.wedge) @ axes).tolist(),
         }
         return np.array([value for kind in self.free for value in of_kind[kind]])
@@ -102,7 +102,8 @@ class Slab:
         panels = zip(self.materials, self.chamber.panels, strict=True)
         return float(sum(panel.thickness for m, panel in panels if m == material))
 
-    def _index(self, material: int) -> float:
+    def index(self, material: int) -> float:
+        """Of a material."""
         return self.chamber.panels[self.materials.index(material)].index
 
     def shares(self) -> Array:
@@ -160,9 +161,9 @@ class Slab:
         """Which parameters stand at the lower and at the upper end of their range, (P,) each."""
         low = (
             [self.thickness(m) <= THICKNESS_RANGE[0] for m in self.thick],
-            [self._index(m) <= INDEX_RANGE[0] for m in range(self.count)],
+            [self.index(m) <= INDEX_RANGE[0] for m in range(self.count)],
         )
-        high = [False] * len(self.thick), [self._index(m) >= INDEX_RANGE[1] for m in range(self.count)]
+        high = [False] * len(self.thick), [self.index(m) >= INDEX_RANGE[1] for m in range(self.count)]
         ends = []
         for thickness, index in (low, high):
             of_kind: dict[Kind, list[bool]] = {
@@ -189,12 +190,14 @@ class View:
     """Where a camera seems to see N points, (N, 3), and how that moves; P parameters as `Slab.names` lists them.
 
     All in the reference frame's orientation, from the camera's centre. point: (N, 3, 3). parameters: (N, 3, P).
+    centre: (N, 3, 3), by the camera's place with the points' places from it held: a wedge alone is sensitive to that.
     """
 
     seen: Array
     status: types.Status
     point: Array
     parameters: Array
+    centre: Array
 
 
 def apparent(slab: Slab, points: Array, centre: Array) -> tuple[Array, types.Status]:
@@ -216,16 +219,17 @@ def view(slab: Slab, points: Array, centre: Array) -> View:
         "index": bend.index @ mine,
         "wedge": np.zeros((len(points), 3, 2)),
     }
-    seen, point = bend.seen, bend.point
+    seen, point, by_centre = bend.seen, bend.point, np.zeros((len(points), 3, 3))
     if any(slab.wedge) or "wedge" in slab.free:
-        moved, by_seen, by_normal, by_index, by_wedge = _deviation(slab, bend.seen, centre)
+        moved, by_seen, by_normal, by_index, by_wedge, by_centre = _deviation(slab, bend.seen, centre)
         columns = {kind: column + by_seen @ column for kind, column in columns.items()}
         columns["tilt"] = columns["tilt"] + by_normal @ axes
         columns["index"][..., slab.materials[0]] += by_index
         columns["wedge"] = by_wedge @ axes
         seen, point = seen + moved, point + by_seen @ point
     parameters = [columns[kind] for kind in slab.free]
-    return View(seen, bend.status, point, np.concatenate([np.zeros((len(points), 3, 0)), *parameters], -1))
+    stacked = np.concatenate([np.zeros((len(points), 3, 0)), *parameters], -1)
+    return View(seen, bend.status, point, stacked, by_centre)
 
 
 def across(normal: tuple[float, float, float] | Array) -> Array:
@@ -242,9 +246,9 @@ def _seen_from(slab: Slab, centre: Array) -> Chamber:
     return slab.chamber.transformed(np.concatenate([np.zeros(3), -np.asarray(centre)]))
 
 
-def _deviation(slab: Slab, seen: Array, centre: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _deviation(slab: Slab, seen: Array, centre: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
     """How the wedge moves points seen at P', (N, 3), and derivatives: by P' (N, 3, 3), by the normal (N, 3, 3; the wedge
-    carried along), by the index of the first material (N, 3), by W (N, 3, 3).
+    carried along), by the index of the first material (N, 3), by W, by the camera's centre (N, 3, 3).
     """  # fmt: skip
     n, W, N = np.asarray(slab.chamber.normal), np.asarray(slab.wedge), slab.chamber.panels[0].index
     gaps = np.concatenate([[0.0], np.cumsum(slab.chamber.gaps)])
@@ -273,4 +277,5 @@ def _deviation(slab: Slab, seen: Array, centre: Array) -> tuple[Array, Array, Ar
     by_normal = outer(v, h_n) + h[:, None, None] * turned
     by_index = (L * (1 - D / z) * N / root)[:, None] * v
     by_wedge = h[:, None, None] * (np.eye(3) - outer(normals, seen) / z[:, None, None])
-    return h[:, None] * v, by_seen, by_normal, by_index, by_wedge
+    by_centre = outer((L * g / z)[:, None] * v, normals)
+    return h[:, None] * v, by_seen, by_normal, by_index, by_wedge, by_centre
