@@ -184,8 +184,8 @@ def results(findings: Findings, clock: Clock) -> dict[str, object]:
         "wet_camera_in_dry_frame_m": wet_in_dry,
         "infinity_sigma_px": {name: field.typical for name, field in sigmas.items()},
         "infinity_expected_rms_px": {name: field.expected_rms for name, field in sigmas.items()},
-        "expected_rms_px": {
-            name: {distance_words(d): field.expected_rms for d, field in fields.items()}
+        "typical_sigma_px": {
+            name: {distance_words(d): field.typical for d, field in fields.items()}
             for name, fields in findings.ranges.items()
         },
         "variance_by_cause": findings.made_of,
@@ -200,7 +200,12 @@ def results(findings: Findings, clock: Clock) -> dict[str, object]:
                 "counts": each.frames,
                 "failure": each.failure,
                 "differences": {
-                    distance_words(d.distance): {"rms_px": d.rms, "max_px": d.max, "expected_rms_px": d.expected_rms}
+                    distance_words(d.distance): {
+                        "found_px": d.found,
+                        "max_px": d.max,
+                        "expected_px": d.expected,
+                        "ratio": d.ratio,
+                    }
                     for d in each.differences
                 },
             }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,7 +23,7 @@ from rainstereo.types import Array
 STEREO = "wet against dry"
 DISTANCES = (np.inf, 2.0, 0.5)
 DEPTHS = (0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0)
-PIXELS = "matching noise"
+PIXELS, ALONE = "matching noise", "dry camera alone, infinity"
 
 
 def distance_words(distance: float) -> str:
@@ -86,21 +87,23 @@ class Findings:
         """For each figure the variance that each part contributes, in the square of its unit (pixels, millimetres)."""
         if self.solution is None or self.spread is None:
             return {}
-        solution, slab = self.solution, self.spread.slab
+        solution, spread, slab = self.solution, self.spread, self.spread.slab
 
-        def pixels(distance: float, cov: Covariance) -> float:
-            field = range_uncertainty.stereo_uncertainty(solution, distance, (8, 6), cov=cov, slab=slab)
-            return field.expected_rms**2
+        def over_image(field_of: Callable[[Covariance], UncertaintyMap]) -> dict[str, float]:
+            """The typical variance, divided as at the median pixel: a corner that no board saw does not decide."""
+            parts = {name: field_of(cov).variance for name, cov in spread.parts.items()}
+            whole = sum(parts.values(), np.zeros(()))
+            share = {name: float(np.nanmedian(part / whole)) for name, part in parts.items()}
+            return {name: each / sum(share.values()) * float(np.nanmedian(whole)) for name, each in share.items()}
 
-        told = {
-            f"{STEREO}, {distance_words(d)}": self.spread.shares(lambda cov, d=d: pixels(d, cov)) for d in DISTANCES
-        }  # type: ignore[misc]
-        told["dry camera alone, infinity"] = self.spread.shares(
-            lambda cov: (
-                uncertainty.infinity_uncertainty(solution, "dry", (8, 6), gauge="image", cov=cov).expected_rms ** 2
-            )
+        def stereo(distance: float) -> Callable[[Covariance], UncertaintyMap]:
+            return lambda cov: range_uncertainty.stereo_uncertainty(solution, distance, (8, 6), cov=cov, slab=slab)
+
+        told = {f"{STEREO}, {distance_words(d)}": over_image(stereo(d)) for d in DISTANCES}
+        told[ALONE] = over_image(
+            lambda cov: uncertainty.infinity_uncertainty(solution, "dry", (8, 6), gauge="image", cov=cov)
         )
-        told["baseline"] = self.spread.shares(lambda cov: (1000 * uncertainty.baseline_sigma(solution, cov)) ** 2)
+        told["baseline"] = spread.shares(lambda cov: (1000 * uncertainty.baseline_sigma(solution, cov)) ** 2)
         at_two = self.depth_sigmas(np.array([2.0]))
         told["depth at 2 m"] = {name: float((1000 * values[0]) ** 2) for name, values in at_two.items()}
         return told

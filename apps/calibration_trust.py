@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from rainstereo.apps import trust_figures
-from rainstereo.apps.calibration_findings import DEPTHS, DISTANCES, PIXELS, STEREO, Findings, distance_words, limits
+from rainstereo.apps.calibration_findings import (
+    ALONE,
+    DEPTHS,
+    DISTANCES,
+    PIXELS,
+    STEREO,
+    Findings,
+    distance_words,
+    limits,
+)
 from rainstereo.apps.report import Report, quantity
 from rainstereo.calib.solve import Solution
 
@@ -26,14 +35,16 @@ def reach(report: Report, solution: Solution, findings: Findings) -> None:
         "A low RMS says nothing about places where no board was held, nor about the panels. These maps do: one sigma "
         f"of where a point is seen, in the worst direction, predicted from the corners used{through}.",
     )
-    rows = {name: [field.sigma for field in fields.values()] for name, fields in findings.ranges.items()}
-    columns = [distance_words(d) for d in DISTANCES]
+    rows = {
+        name: {f"{name}, {distance_words(d)}": field.sigma for d, field in fields.items()}
+        for name, fields in findings.ranges.items()
+    }
     report.figure(
-        trust_figures.map_rows({STEREO: rows.pop(STEREO)}, columns, solution.rig.dry.size, "px"),
+        trust_figures.map_rows([rows.pop(STEREO)], solution.rig.dry.size, "px"),
         "The wet pixel that belongs to a dry pixel: what stays in aligned pairs of a scene at that distance.",
     )
     report.figure(
-        trust_figures.map_rows(rows, columns, solution.rig.dry.size, "px"),
+        trust_figures.map_rows(list(rows.values()), solution.rig.dry.size, "px"),
         "Each camera alone, after the rotation of its axes that fits best.",
     )
 
@@ -43,7 +54,7 @@ def limiting(report: Report, findings: Findings) -> None:
     if findings.spread is None:
         return
     far = findings.made_of[f"{STEREO}, {distance_words(np.inf)}"]
-    alone = findings.made_of["dry camera alone, infinity"]
+    alone = findings.made_of[ALONE]
     worst = max(alone, key=lambda name: alone[name])
     lead = f"Far directions of the dry camera are limited by {limits(alone)}; alignment far away by {limits(far)}."
     report.section("What limits it", f"{lead} {REMEDIES.get(worst, '')}".strip())
@@ -56,7 +67,7 @@ def limiting(report: Report, findings: Findings) -> None:
     parts = {name: [findings.made_of[label].get(name, 0.0) for label in labels] for name in names}
     report.figure(
         trust_figures.shares(labels, {name: v for name, v in parts.items() if any(v)}, totals),
-        "What the variance of each figure is made of; on the right one sigma of it (over the image: root mean square).",
+        "What the variance of each figure is made of; on the right one sigma of it (over the image: the median).",
     )
     if findings.spread.assumed and findings.spread.slab is not None:
         report.text(
@@ -88,11 +99,11 @@ def agreement(report: Report, solution: Solution, findings: Findings) -> None:
         + (f" The largest is {worst:.1f} times that." if done else ""),
     )
     if done:
-        maps = {"": [np.linalg.norm(each.differences[0].by, axis=-1) for each in done]}
-        top = max(1e-6, *(float(np.nanpercentile(m, 98)) for m in maps[""]))
-        names = [each.name.split(" (")[0] for each in done]
+        maps = [{each.name.split(" (")[0]: np.sqrt(each.differences[0].square)} for each in done]
+        top = max(1e-6, *(float(np.nanpercentile(m, 95)) for row in maps for m in row.values()))
+        pairs = [row | other for row, other in zip(maps[::2], maps[1::2], strict=False)]
         report.figure(
-            trust_figures.map_rows(maps, names, solution.rig.dry.size, "px", top),
+            trust_figures.map_rows(pairs or maps, solution.rig.dry.size, "px", top),
             "By how much the wet pixel that belongs to a dry pixel at infinity differs.",
         )
     rows = []
@@ -100,9 +111,15 @@ def agreement(report: Report, solution: Solution, findings: Findings) -> None:
         cells: list[str | float] = []
         for d in DISTANCES:
             found = each.at(d)
-            cells += [float("nan")] * 3 if found is None else [found.rms, found.expected_rms, round(found.ratio, 2)]
+            cells += [float("nan")] * 3 if found is None else [found.found, found.expected, round(found.ratio, 2)]
         rows.append((each.name + (f": {each.failure}" if each.failure else ""), *cells))
     header = ["frames"]
     for d in DISTANCES:
-        header += [f"{distance_words(d)}: rms, px", "expected", "ratio"]
-    report.table(header, rows, numbers=range(1, len(header)))
+        header += [f"{distance_words(d)}: found, px", "expected, px", "ratio"]
+    report.table(
+        header,
+        rows,
+        "Medians over the image; the ratio is the root mean square in units of what is expected at each pixel. "
+        "1 is what noise of the corners does; 2 and more is more than chance.",
+        numbers=range(1, len(header)),
+    )
