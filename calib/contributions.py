@@ -48,7 +48,13 @@ class Contributions:
 
 
 def contributions(solution: Solution) -> Contributions:
-    """Of a solution whose panels were taken as described; their standard deviations are those of its chamber."""
+    """Of a solution; panels that were taken as described err by the standard deviations of their chamber.
+
+    Panels that were estimated have no part of their own: what corners and description say of them is one.
+    """
+    if solution.estimate is not None:
+        cov = solution.estimate.covariance
+        return Contributions(solution.estimate.slab, cov, {CORNERS: cov})
     chamber = solution.rig.chamber
     if chamber is None or not chamber.panels:
         cov = uncertainty.covariance(solution)

@@ -22,7 +22,7 @@ from rainstereo.calib.rotation import rotated_by
 from rainstereo.calib.slab import Slab
 from rainstereo.chamber import Chamber
 from rainstereo.refraction import Status
-from rainstereo.types import Array, Mask
+from rainstereo.types import Array, Indices, Mask
 
 
 class ChamberError(SolveError):
@@ -35,12 +35,15 @@ class Panels:
 
     slab: the panels as they are now, in the frame of the problem's first camera.
     frames: which of the problem's frames were taken through them, (F,); None: all.
+    ties: (F,), for each frame the number of the frame whose pose it shares (its own where it shares none): the board
+    and the rig stood still while the panels were put in between. None: none shares.
     prior: what is known of the panels beforehand. noise_px: standard deviation of a corner's coordinate, by which the
     prior's rows, which are in sigmas, are weighed against pixels.
     """
 
     slab: Slab
     frames: Mask | None = None
+    ties: Indices | None = None
     prior: Prior | None = None
     noise_px: float = 0.0
 
@@ -53,12 +56,29 @@ class Panels:
         """For each of these frames whether it was taken through the panels."""
         return np.ones(len(frames), dtype=np.bool_) if self.frames is None else np.asarray(self.frames[frames])
 
+    def spread(self, layout: Layout, array: Array) -> Array:
+        """An array whose first axis is the state, with the poses of frames that share another's copied from there."""
+        if self.ties is None or not layout.frames.stop:
+            return array
+        span, fresh = layout.frames, array.copy()
+        poses = array[span].reshape(-1, 6, *array.shape[1:])
+        fresh[span] = poses[self.ties].reshape(array[span].shape)
+        return fresh
+
+    def shared(self, layout: Layout) -> Mask:
+        """Which columns of the state only repeat others, (S,)."""
+        columns = np.zeros(layout.size, dtype=np.bool_)
+        if self.ties is not None and layout.frames.stop:
+            columns[layout.frames] = np.repeat(self.ties != np.arange(len(self.ties)), 6)
+        return columns
+
 
 @dataclass(frozen=True)
 class Normal:
     """Normal equations at a state: J'J (S, S), J'x (S,), the cost |x|^2, and mrcal's packed state itself.
 
-    held: the part of J'J that comes from mrcal's regularization, which carries no noise. scale: (S,): state = scale *
+    held: the part of J'J that carries no noise: mrcal's regularization, and ones on the diagonal for poses that are
+    shared and hence no parameters of their own. scale: (S,): state = scale *
     packed state. layout: of the S columns. widest(step): by how many pixels, at most, a step moves a corner.
     """
 
@@ -140,6 +160,8 @@ def normal_equations(problem: Problem, observed: Array, panels: Chamber | Panels
         matrix[layout.slab, layout.slab] += panels.noise_px**2 * by_slab.T @ by_slab
         gradient[layout.slab] += panels.noise_px**2 * by_slab.T @ rows
         total += panels.noise_px**2 * float(rows @ rows)
+    for part in (matrix, regularization):
+        part[np.diag_indices(layout.size)] += panels.shared(layout)
     return Normal(matrix, gradient, total, at.packed, regularization, scale, layout, tuple(blocks))
 
 
@@ -168,7 +190,8 @@ def _rows(
     if layout.frames.stop:
         turned = np.stack([rotated_by(r, board) for r in problem.rt_ref_board[frames, :3]])
         parts += [by_reference @ turned, by_reference]
-        columns.append(layout.frames.start + 6 * frames[:, None] + np.arange(6))
+        owners = frames if panels.ties is None else panels.ties[frames]
+        columns.append(layout.frames.start + 6 * owners[:, None] + np.arange(6))
     if layout.warp.stop:
         shapes = [_board(problem, unit)[..., 2].ravel() for unit in np.eye(2)]
         normals = pose.rotation_matrix(problem.rt_ref_board[frames, :3])[..., 2]

@@ -41,6 +41,8 @@ def panels(solution: Solution, cov: Covariance | None = None) -> Slab | None:
     """The solution's panels with the parameters that a covariance counts; None where there are no panels."""
     if solution.rig.chamber is None:
         return None
+    if solution.estimate is not None:
+        return solution.estimate.slab
     return Slab(solution.rig.chamber)
 
 

@@ -65,10 +65,12 @@ def refine(problem: Problem, seen: Array, panels: Chamber | Panels, *, tolerance
     ChamberError if that does not happen within MAX_PASSES.
     """
     panels = Panels.of(panels)
+    if panels.ties is not None:
+        problem.rt_ref_board = problem.rt_ref_board[panels.ties].copy()
     damping, change, best = DAMPING, np.inf, refracted.normal_equations(problem, seen, panels)
     taking_part = problem.observations[..., 2] > 0
     for count in range(1, MAX_PASSES + 1):
-        step = _step(best, damping, _stuck(panels, best))
+        step = panels.spread(best.layout, _step(best, damping, _stuck(panels, best)))
         trial, moved = problem.copy(), _ahead(panels, best, step)
         versions.ingest(trial, best.packed + step[: len(best.packed)])
         cost = _cost(trial, seen, moved)

@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import scipy.linalg
 import scipy.stats
 
 from rainstereo import pose
@@ -25,34 +24,16 @@ from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.mrcal_versions import Layout, Problem
 from rainstereo.calib.rotation import cross_matrix, rotated_by
 from rainstereo.calib.solve import Solution
+from rainstereo.calib.state_covariance import Covariance as Covariance
+from rainstereo.calib.state_covariance import regular_inverse as regular_inverse
 from rainstereo.rig import ROLES, Rig, Role
 from rainstereo.types import Array, Mask
 
 GRID = (24, 18)
 MARGIN = 0.02
 """Grids keep this fraction of the image away from its border."""
-RECIPROCAL_CONDITION = 1e-14
 
 Gauge = Literal["boards", "image"]
-
-
-@dataclass(frozen=True, eq=False)
-class Covariance:
-    """Covariance of everything a solution estimated, (S, S) in SI units and pixels, as `layout` lays it out.
-
-    First comes mrcal's state, then, in `layout.slab`, the panels' parameters as `slab.Slab.names` lists them (angles of
-    the common normal in radians, metres of each material, indices, wedge in radians); none where nothing is
-    uncertain about the panels, or there are none. Rows and columns between the two say how lenses, poses and boards
-    move with the panels.
-
-    sigma: standard deviation of a corner's coordinate, pixels, from residuals and degrees of freedom.
-    condition: of the scaled normal equations; beyond 1e14 something is not determined by the data at all.
-    """
-
-    matrix: Array
-    layout: Layout
-    sigma: float
-    condition: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +87,12 @@ class UncertaintyMap:
 
 
 def covariance(solution: Solution | Problem) -> Covariance:
-    """Covariance of the solution's state, from its residuals and mrcal's Jacobian."""
+    """Covariance of the solution's state, from its residuals and mrcal's Jacobian.
+
+    Where panels were estimated it is that of the joint solve, with their parameters.
+    """
+    if not isinstance(solution, Problem) and solution.estimate is not None:
+        return solution.estimate.covariance
     problem = problem_of(solution)
     linear = versions.linearize(problem)
     rows = linear.jacobian[: linear.boards]
@@ -125,18 +111,6 @@ def covariance(solution: Solution | Problem) -> Covariance:
 def problem_of(solution: Solution | Problem) -> Problem:
     """What mrcal solved, from a solution or given as it is."""
     return solution if isinstance(solution, Problem) else solution.problem
-
-
-def regular_inverse(normal: Array) -> tuple[Array, float]:
-    """Inverse of a symmetric positive matrix and its condition after scaling its diagonal to one.
-
-    Directions that are not determined get a large finite variance, so that what does not depend on them stays known.
-    """
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    w, U = scipy.linalg.eigh(normal * np.outer(scale, scale), driver="evd", check_finite=False)
-    condition = float(w[-1] / max(w[0], w[-1] * 1e-17))
-    w = np.maximum(w, w[-1] * RECIPROCAL_CONDITION)
-    return (U / w) @ U.T * np.outer(scale, scale), condition
 
 
 def baseline_sigma(solution: Solution | Problem, cov: Covariance | None = None) -> float:
