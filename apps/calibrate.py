@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from rainstereo import Chamber
-from rainstereo.apps.calibration_page import Findings, page
+from rainstereo.apps.calibration_findings import Findings, distance_words
+from rainstereo.apps.calibration_page import page
 from rainstereo.apps.cli import DONE, FAILED
 from rainstereo.apps.run_record import Record
-from rainstereo.calib import checks, mrcal_versions, uncertainty
+from rainstereo.calib import checks, consistency, mrcal_versions, uncertainty
 from rainstereo.calib.board import Board
 from rainstereo.calib.cross_validation import choose_lensmodel
 from rainstereo.calib.mrcal_versions import SolveError
@@ -47,6 +48,8 @@ class Options:
     """auto: chosen by cross-validation; or LENSMODEL_OPENCV4, 5, 8, 12, or splined."""
     expected_baseline_mm: float | None = None
     """What the drawing says; a different result is questioned."""
+    cross_validate: bool = True
+    """Repeat the calibration on halves of the pairs and without each range of distances, and compare in pixels."""
     pictures: Path | None = None
     """Folder for each picture of the report as a file of its own."""
     cache: Path | None = None
@@ -84,7 +87,13 @@ def run(options: Options) -> int:
         observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance
     )
     clock("uncertainty and checks")
-    return _finish(options, record, Findings(observations, solution, covariance, choice, verdict, chamber), clock)
+    comparisons = None
+    if options.cross_validate:
+        comparisons = consistency.compare(solution)
+        verdict = checks.Verdict((*verdict.findings, *consistency.doubts(comparisons)))
+        clock("cross-validation")
+    findings = Findings(observations, solution, covariance, choice, verdict, chamber, comparisons)
+    return _finish(options, record, findings, clock)
 
 
 class Clock:
@@ -143,7 +152,7 @@ def _finish(options: Options, record: Record, findings: Findings, clock: Clock) 
 
 def summary(solution: Solution, findings: Findings) -> str:
     """The calibration in one line."""
-    sigma = uncertainty.baseline_sigma(solution, findings.covariance)
+    sigma = findings.baseline_sigma()
     return (
         f"{solution.lensmodel}: {solution.rms_px:.3f} px RMS per coordinate, "
         f"baseline {solution.rig.baseline * 1000:.3f} +- {sigma * 1000:.3f} mm, {len(solution.names)} pairs, "
@@ -171,10 +180,37 @@ def results(findings: Findings, clock: Clock) -> dict[str, object]:
         "rms_px": solution.rms_px,
         "rms_px_by_role": solution.rms_by_role,
         "baseline_m": solution.rig.baseline,
-        "baseline_sigma_m": uncertainty.baseline_sigma(solution, findings.covariance),
+        "baseline_sigma_m": findings.baseline_sigma(),
         "wet_camera_in_dry_frame_m": wet_in_dry,
         "infinity_sigma_px": {name: field.typical for name, field in sigmas.items()},
         "infinity_expected_rms_px": {name: field.expected_rms for name, field in sigmas.items()},
+        "typical_sigma_px": {
+            name: {distance_words(d): field.typical for d, field in fields.items()}
+            for name, fields in findings.ranges.items()
+        },
+        "variance_by_cause": findings.made_of,
+        "panels_sd_assumed": findings.spread is not None
+        and findings.spread.slab is not None
+        and findings.spread.assumed,
+        "cross_validation": None
+        if findings.comparisons is None
+        else [
+            {
+                "frames": each.name,
+                "counts": each.frames,
+                "failure": each.failure,
+                "differences": {
+                    distance_words(d.distance): {
+                        "found_px": d.found,
+                        "max_px": d.max,
+                        "expected_px": d.expected,
+                        "ratio": d.ratio,
+                    }
+                    for d in each.differences
+                },
+            }
+            for each in findings.comparisons
+        ],
         "outliers": solution.outlier_count,
         "corners": solution.corner_count,
         "corners_by_role": {role: int(np.isfinite(solution.residuals[role][..., 0]).sum()) for role in ROLES},

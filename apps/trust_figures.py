@@ -16,35 +16,31 @@ FloatArray = npt.NDArray[np.float64]
 
 @styled
 def map_rows(
-    rows: Mapping[str, Sequence[npt.ArrayLike]],
-    columns: Sequence[str],
-    size: tuple[int, int],
-    unit: str,
-    top: float | None = None,
+    rows: Sequence[Mapping[str, npt.ArrayLike]], size: tuple[int, int], unit: str, top: float | None = None
 ) -> Figure:
-    """Scalars over the image plane, one row of maps for each name, all in one colour scale.
+    """Scalars over the image plane in rows of as many maps each, all in one colour scale.
 
-    rows : name -> maps (H, W), one for each of `columns`, on grids whose first and last samples lie on the image's
-    outermost pixel centres; NaN = unknown. top : the value at which the colour ends (98th percentile by default).
+    rows : title -> map (H, W), on grids whose first and last samples lie on the image's outermost pixel centres; NaN =
+    unknown. top : the value at which the colour ends (98th percentile by default).
     """
-    for name, maps in rows.items():
-        same_length("columns", columns, name, maps)
-    known = np.concatenate([np.asarray(m, float).ravel() for maps in rows.values() for m in maps] or [np.zeros(0)])
+    for row in rows[1:]:
+        same_length("the first row", list(rows[0]), "another row", list(row))
+    known = np.concatenate([np.asarray(m, float).ravel() for row in rows for m in row.values()] or [np.zeros(0)])
     known = known[np.isfinite(known)]
     top = (float(np.percentile(known, 98)) if known.size else 1.0) if top is None else top
     top = top if top > 0 else 1.0
     width, height = size
-    each = 9.2 / len(columns)
-    figure, grid = sheet(9.2, len(rows) * (0.82 * each * height / width + 0.42), len(rows), len(columns), squeeze=False)
+    each = 9.2 / len(rows[0])
+    figure, grid = sheet(9.2, len(rows) * (0.82 * each * height / width + 0.42), len(rows), len(rows[0]), squeeze=False)
     mesh = None
-    for line, (name, maps) in zip(grid, rows.items(), strict=True):
-        for axes, values, title in zip(line, maps, columns, strict=True):
+    for line, row in zip(grid, rows, strict=True):
+        for axes, (title, values) in zip(line, row.items(), strict=True):
             field = np.asarray(values, float)
             x, y = np.linspace(0, width - 1, field.shape[1]), np.linspace(0, height - 1, field.shape[0])
             mesh = axes.pcolormesh(x, y, field, cmap=RAIN, vmin=0, vmax=top, shading="gouraud")
             mesh.set_rasterized(True)
             seen = field[np.isfinite(field)]
-            levels = ladder(float(seen.min()), top)[-4:] if seen.size and np.ptp(seen) > 0 else []
+            levels = ladder(float(seen.min()), float(np.percentile(seen, 92)))[-3:] if seen.size else []
             if levels:
                 drawn = axes.contour(x, y, field, levels=levels, colors="#0b1a29", linewidths=0.6)
                 axes.clabel(drawn, fmt=lambda v: f"{v:g}", fontsize=7)
@@ -52,7 +48,7 @@ def map_rows(
             axes.grid(False)
             axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
             middle = f", median {np.median(seen):.2g}" if seen.size else ", no answer"
-            axes.set_title(f"{name}, {title}{middle}" if name else f"{title}{middle}", fontsize=9)
+            axes.set_title(f"{title}{middle}", fontsize=9)
     if mesh is not None:
         bar = figure.colorbar(
             mesh, ax=grid, label=unit, shrink=min(1.0, 1.4 / len(rows)), pad=0.01, aspect=30,

@@ -18,6 +18,7 @@ import numpy as np
 from rainstereo import pose, refraction
 from rainstereo.calib import adjust, range_uncertainty, through_acrylic, uncertainty
 from rainstereo.calib import mrcal_versions as versions
+from rainstereo.calib.checks import Finding
 from rainstereo.calib.mrcal_versions import Problem, SolveError
 from rainstereo.calib.solve import Solution
 from rainstereo.camera import Camera
@@ -30,6 +31,14 @@ GRID = (16, 12)
 FEWEST = 4
 """Frames that a part must have to be calibrated at all."""
 BANDS = ("nearest", "middle", "farthest")
+LITTLE = 1e-4
+"""Where less than this share of the largest variance is expected, variances of a part and of the whole cancelled."""
+DOUBTFUL_RATIO, DOUBTFUL_PX = 2.0, 0.03
+"""Noise alone seldom differs by twice what it should, and what is smaller than this harms nobody."""
+REMEDY = (
+    "something is not as the model has it: check that the panels are given and their figures right, that the board is "
+    "flat and held still, and that nothing is loose"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,30 +46,42 @@ class Difference:
     """How far two calibrations differ for points at a distance (metres from the dry camera).
 
     pixels: (rows, columns, 2) of the dry camera. by: (rows, columns, 2) wet pixels, NaN where one has no answer.
-    expected_rms: length over the grid that noise of the corners accounts for, pixels.
+    variance: (rows, columns) square pixels, mean square of the length that noise of the corners accounts for.
     """
 
     distance: float
     pixels: Array
     by: Array
-    expected_rms: float
+    variance: Array
 
     @property
-    def rms(self) -> float:
-        """Root of the mean square of the length over the grid, pixels."""
-        square = (self.by**2).sum(-1)
-        return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else float("nan")
+    def square(self) -> Array:
+        """Squared length, (rows, columns) square pixels."""
+        return np.asarray((self.by**2).sum(-1))
+
+    @property
+    def found(self) -> float:
+        """Typical length (root of the median square over the grid), pixels: a lone corner does not decide."""
+        known = self.square[np.isfinite(self.square)]
+        return float(np.sqrt(np.median(known))) if known.size else float("nan")
+
+    @property
+    def expected(self) -> float:
+        """What `found` would be about, were there only noise of the corners, pixels."""
+        known = self.variance[np.isfinite(self.variance)]
+        return float(np.sqrt(max(np.median(known), 0.0))) if known.size else float("nan")
 
     @property
     def max(self) -> float:
         """Largest length over the grid, pixels."""
-        length = np.linalg.norm(self.by, axis=-1)
-        return float(np.nanmax(length)) if np.isfinite(length).any() else float("nan")
+        known = self.square[np.isfinite(self.square)]
+        return float(np.sqrt(known.max())) if known.size else float("nan")
 
     @property
     def ratio(self) -> float:
-        """Found over expected: about 1 where corner noise is all there is."""
-        return self.rms / self.expected_rms if self.expected_rms > 0 else float("nan")
+        """Root mean square of the length in units of what is expected there: about 1 where all is corner noise."""
+        told = np.isfinite(self.square) & (self.variance > LITTLE * np.nanmax(self.variance, initial=0.0))
+        return float(np.sqrt(np.mean(self.square[told] / self.variance[told]))) if told.any() else float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +116,22 @@ def compare(
         span = f"{far[band].min():.2f} to {far[band].max():.2f} m" if len(band) else "none"
         comparisons.append(_without(solution, left_out, f"without the {name} boards ({span})", distances, grid))
     return tuple(comparisons)
+
+
+def doubts(comparisons: Sequence[Comparison]) -> list[Finding]:
+    """Where parts of a capture differ by more than DOUBTFUL_RATIO of what noise explains, and by DOUBTFUL_PX."""
+    found = []
+    for each in comparisons:
+        beyond = [d for d in each.differences if d.ratio > DOUBTFUL_RATIO and d.found > DOUBTFUL_PX]
+        if beyond:
+            worst = max(beyond, key=lambda d: d.ratio)
+            where = "at infinity" if np.isinf(worst.distance) else f"at {worst.distance:g} m"
+            text = (
+                f"{each.name}: the wet pixel that belongs to a dry pixel {where} differs by {worst.found:.2f} px, "
+                f"{worst.ratio:.1f} times what noise of the corners explains"
+            )
+            found.append(Finding("doubtful", text, REMEDY))
+    return found
 
 
 def part(solution: Solution, kept: Mask) -> Solution:
@@ -148,11 +185,8 @@ def _differences(
             np.trace(range_uncertainty.stereo_uncertainty(each, distance, grid, cov=cov).covariance, axis1=-2, axis2=-1)
             for each, cov in zip(pair, covariances, strict=True)
         )
-        spread = own + sign * other
-        known = np.isfinite(spread)
-        expected = float(np.sqrt(max(float(np.mean(spread[known])), 0.0))) if known.any() else float("nan")
         by = wet_pixels(pair[0].rig, pixels, distance) - wet_pixels(pair[1].rig, pixels, distance)
-        found.append(Difference(distance, pixels, by, expected))
+        found.append(Difference(distance, pixels, by, own + sign * other))
     return tuple(found)
 
 

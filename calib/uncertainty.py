@@ -55,6 +55,11 @@ class UncertaintyMap:
         return np.asarray(np.sqrt((a + b) / 2 + np.hypot((a - b) / 2, c)))
 
     @property
+    def variance(self) -> Array:
+        """Expected squared length of the error, (rows, columns) square pixels."""
+        return np.asarray(np.trace(self.covariance, axis1=-2, axis2=-1))
+
+    @property
     def typical(self) -> float:
         """Median over the grid of the expected length of the error, pixels; where the lens does not reach it is inf."""
         square = np.trace(self.covariance, axis1=-2, axis2=-1)
