@@ -16,15 +16,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rainstereo import pose, refraction
-from rainstereo.calib import adjust, range_uncertainty, through_acrylic, uncertainty
+from rainstereo.calib import adjust, joint, range_uncertainty, through_acrylic, uncertainty
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.checks import Finding
 from rainstereo.calib.mrcal_versions import Problem, SolveError
+from rainstereo.calib.refracted import Panels
+from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution
+from rainstereo.calib.sought import seen_through
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
 from rainstereo.rig import Rig
-from rainstereo.types import Array, Mask
+from rainstereo.types import Array, Indices, Mask
 
 DISTANCES = (np.inf, 2.0, 0.5)
 GRID = (16, 12)
@@ -106,8 +109,9 @@ def compare(
     Starts from the solution, so each part takes a few passes. seed: draws the halves.
     """
     frames, count = solution.rt_ref_board, len(solution.names)
-    order = np.random.default_rng([seed, 0x4A1F]).permutation(count)
-    first = np.isin(np.arange(count), order[: count // 2])
+    group = np.arange(count) if solution.panels is None or solution.panels.ties is None else solution.panels.ties
+    views = np.random.default_rng([seed, 0x4A1F]).permutation(np.unique(group))
+    first = np.isin(group, views[: len(views) // 2])  # images of a board that stood still stay together
     comparisons = [_halves(solution, first, distances, grid)]
     centre = _middle(solution)
     far = np.linalg.norm(pose.rotation_matrix(frames[:, :3]) @ centre + frames[:, 3:], axis=-1)
@@ -139,15 +143,27 @@ def part(solution: Solution, kept: Mask) -> Solution:
 
     What the solution says about frames (residuals, outliers, names) stays that of all frames.
     """
-    chamber = solution.rig.chamber
     problem = adjust.without(solution.problem, ~kept)
-    if chamber is None:
+    if solution.rig.chamber is None:
         versions.optimize(problem)
-    else:
-        shift = through_acrylic.shift(solution.problem, chamber)
-        seen = (solution.problem.observations[..., :2] + shift)[kept[solution.problem.indices[:, 0]]]
-        through_acrylic.refine(problem, seen, chamber)
-    return replace(solution, problem=problem, rig=_rig(problem, chamber), rt_ref_board=problem.rt_ref_board)
+        return replace(solution, problem=problem, rig=_rig(problem, None), rt_ref_board=problem.rt_ref_board)
+    panels = solution.panels or Panels(Slab(solution.rig.chamber))
+    seen = seen_through(solution.problem, panels)[kept[solution.problem.indices[:, 0]]]
+    panels = replace(panels, frames=None if panels.frames is None else panels.frames[kept], ties=_ties(panels, kept))
+    through_acrylic.refine(problem, seen, panels)
+    estimate = None if solution.estimate is None else joint.judged(problem, seen, panels)
+    return replace(
+        solution, problem=problem, rig=_rig(problem, panels.slab.chamber), rt_ref_board=problem.rt_ref_board,
+        panels=panels, estimate=estimate,
+    )  # fmt: skip
+
+
+def _ties(panels: Panels, kept: Mask) -> Indices | None:
+    """The frames' partners among those kept; a frame whose partner is not kept stands alone."""
+    if panels.ties is None:
+        return None
+    place = np.cumsum(kept) - 1
+    return np.where(kept[panels.ties], place[panels.ties], place)[kept].astype(np.intp)
 
 
 def _halves(solution: Solution, first: Mask, distances: Sequence[float], grid: tuple[int, int]) -> Comparison:

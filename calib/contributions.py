@@ -14,14 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rainstereo import pose
 from rainstereo.calib import mrcal_versions as versions
-from rainstereo.calib import refracted, through_acrylic, uncertainty
-from rainstereo.calib import slab as slabs
-from rainstereo.calib.mrcal_versions import Problem
+from rainstereo.calib import refracted, uncertainty
+from rainstereo.calib.joint import Estimate
+from rainstereo.calib.prior import Prior
+from rainstereo.calib.refracted import Panels
 from rainstereo.calib.slab import Kind, Slab
 from rainstereo.calib.solve import Solution
-from rainstereo.calib.uncertainty import Covariance
+from rainstereo.calib.sought import seen_through
+from rainstereo.calib.state_covariance import Covariance, regular_inverse
 from rainstereo.chamber import Chamber
 from rainstereo.types import Array
 
@@ -48,13 +49,13 @@ class Contributions:
 
 
 def contributions(solution: Solution) -> Contributions:
-    """Of a solution; panels that were taken as described err by the standard deviations of their chamber.
+    """Of a solution.
 
-    Panels that were estimated have no part of their own: what corners and description say of them is one.
+    Panels that were taken as described err by the standard deviations of their chamber; of panels that were estimated
+    each kind that a description speaks of is a part, as far as the corners left the word to it.
     """
     if solution.estimate is not None:
-        cov = solution.estimate.covariance
-        return Contributions(solution.estimate.slab, cov, {CORNERS: cov})
+        return _estimated(solution, solution.estimate)
     chamber = solution.rig.chamber
     if chamber is None or not chamber.panels:
         cov = uncertainty.covariance(solution)
@@ -62,18 +63,14 @@ def contributions(solution: Solution) -> Contributions:
     known = chamber.with_uncertainty()
     slab = Slab(known, uncertain(known))
     state, moved = _response(solution, slab)
-    size, free = len(moved), len(slab.names)
+    free = len(slab.names)
     layout = state.layout.with_slab(free)
-    corners = np.zeros((size + free, size + free))
-    corners[:size, :size] = state.matrix
-    parts = {CORNERS: replace(state, matrix=corners, layout=layout)}
-    spread, together = described(slab), np.concatenate([moved, np.eye(free)])
+    parts = {CORNERS: replace(state, matrix=np.pad(state.matrix, (0, free)), layout=layout)}
+    variance, together = Prior(known).sigmas(slab) ** 2, np.concatenate([moved, np.eye(free)])
     for kind in slab.free:
         mine = together[:, _of_kind(slab, kind)]
-        matrix = mine @ spread[_of_kind(slab, kind), _of_kind(slab, kind)] @ mine.T
-        parts[kind] = replace(state, matrix=matrix, layout=layout)
-    total = replace(state, matrix=sum((part.matrix for part in parts.values()), np.zeros_like(corners)), layout=layout)
-    return Contributions(slab, total, parts, chamber.uncertainty is None)
+        parts[kind] = replace(state, matrix=mine * variance[_of_kind(slab, kind)] @ mine.T, layout=layout)
+    return Contributions(slab, _sum(parts), parts, chamber.uncertainty is None)
 
 
 def uncertain(chamber: Chamber) -> tuple[Kind, ...]:
@@ -85,61 +82,49 @@ def uncertain(chamber: Chamber) -> tuple[Kind, ...]:
     return tuple(kind for kind, there in given.items() if there)
 
 
-def described(slab: Slab) -> Array:
-    """Covariance of the slab's parameters, as `Slab.names` lists them, that its chamber's description stands for.
-
-    Panels were measured one by one, so their thicknesses err independently; panels of one material are of one batch
-    and share its index, about which the least certain of them says all there is.
-    """
-    sd = slab.chamber.uncertainty
-    if sd is None:
-        raise ValueError("the chamber states no standard deviations; Chamber.with_uncertainty() gives it usual ones")
-    materials = np.array(slab.materials)
-    variance: dict[Kind, list[float]] = {
-        "tilt": [sd.tilt**2] * 2,
-        "thickness": [float(np.sum(np.square(sd.thickness)[materials == m])) for m in slab.thick],
-        "index": [float(np.max(np.square(sd.index)[materials == m])) for m in range(slab.count)],
-        "wedge": [0.0, 0.0],
-    }
-    return np.diag([value for kind in slab.free for value in variance[kind]])
-
-
 def _response(solution: Solution, slab: Slab) -> tuple[Covariance, Array]:
     """Covariance of mrcal's state from corner noise, through the panels, and how it moves with their parameters."""
-    problem = solution.problem
-    seen = problem.observations[..., :2] + through_acrylic.shift(problem, slab.chamber)
-    normal, at = refracted.normal_equations(problem, seen, slab.chamber), versions.linearize(problem)
-    inverse, condition = uncertainty.regular_inverse(normal.matrix)
-    tied = at.jacobian[at.boards :]
-    corners = normal.matrix - (tied.T @ tied).toarray()
+    panels = replace(solution.panels or Panels(slab), slab=slab, prior=None)
+    problem, free = solution.problem, len(slab.names)
+    normal = refracted.normal_equations(problem, seen_through(problem, panels), panels)
+    own = slice(0, normal.layout.size - free)
+    inverse, condition = regular_inverse(normal.matrix[own, own])
+    corners = normal.matrix[own, own] - normal.held[own, own]
     inliers = int(2 * (problem.observations[..., 2] > 0).sum())
     freedom = inliers - float(np.sum(inverse * corners))
-    square = normal.cost - float(np.sum(at.residuals[at.boards :] ** 2))
-    sigma = float(np.sqrt(square / freedom)) if freedom > 0 else np.inf
-    matrix = inverse @ corners @ inverse * np.outer(at.scale, at.scale) * sigma**2
-    cross = np.zeros((len(matrix), len(slab.names)))
-    for camera, (J, columns) in enumerate(normal.blocks):
-        by_slab = _by_slab(problem, slab, camera)
-        np.add.at(cross, columns, np.swapaxes(J, 1, 2) @ by_slab)
-    moved = -(inverse @ cross) * at.scale[:, None]
-    return Covariance((matrix + matrix.T) / 2, versions.layout(problem), sigma, condition), moved
+    off = versions.residuals(problem) * np.maximum(problem.observations[..., 2:], 0)
+    sigma = float(np.sqrt(np.nansum(off**2) / freedom)) if freedom > 0 else np.inf
+    layout = normal.layout.with_slab(0)
+    matrix = panels.spread(layout, panels.spread(layout, inverse @ corners @ inverse).T)
+    matrix = matrix * np.outer(normal.scale[own], normal.scale[own]) * sigma**2
+    moved = -panels.spread(layout, inverse @ normal.matrix[own, own.stop :]) * normal.scale[own, None]
+    return Covariance((matrix + matrix.T) / 2, layout, sigma, condition), moved
 
 
-def _by_slab(problem: Problem, slab: Slab, camera: int) -> Array:
-    """Derivative of one camera's weighted residuals by the slab, (V, 2 N, K), V views of N corners."""
-    rt = np.zeros(6) if camera == 0 else problem.rt_cam_ref[camera - 1]
-    R, rows = pose.rotation_matrix(rt[:3]), problem.indices[:, 1] == camera
-    board = versions.board_points(*problem.observations.shape[1:3], problem.spacing, problem.warp).reshape(-1, 3)
-    boards = problem.rt_ref_board[problem.indices[rows, 0]]
-    points = np.einsum("vij,nj->vni", pose.rotation_matrix(boards[:, :3]), board) + boards[:, None, 3:]
-    bent = slabs.view(slab, (points + R.T @ rt[3:]).reshape(-1, 3), -R.T @ rt[3:])
-    _, by_apparent, _ = versions.project_gradients(bent.seen @ R.T, problem.lensmodel, problem.intrinsics[camera])
-    weight = np.maximum(problem.observations[rows][..., 2], 0).reshape(-1, 1, 1)
-    by_slab = np.where(weight > 0, by_apparent @ R @ bent.parameters * weight, 0)
-    return np.asarray(by_slab.reshape(len(boards), 2 * len(board), len(slab.names)))
+def _estimated(solution: Solution, estimate: Estimate) -> Contributions:
+    """Rows of corners and of the description carry noise, each its own share of A M A sigma^2."""
+    slab, total, prior = estimate.slab, estimate.covariance, estimate.prior
+    if prior is None or solution.panels is None or not slab.names:
+        return Contributions(slab, total, {CORNERS: total})
+    problem, panels = solution.problem, replace(solution.panels, noise_px=total.sigma)
+    normal = refracted.normal_equations(problem, seen_through(problem, panels), panels)
+    inverse, _ = regular_inverse(normal.matrix)
+    _, by_slab = prior.rows(slab)
+    parts = {}
+    for kind in (kind for kind in slab.free if kind in prior.kinds):
+        toward = inverse[:, normal.layout.slab] @ by_slab[_of_kind(slab, kind)].T * total.sigma**2
+        toward = panels.spread(normal.layout, toward) * normal.scale[:, None]
+        parts[kind] = replace(total, matrix=toward @ toward.T)
+    rest = total.matrix - sum((part.matrix for part in parts.values()), np.zeros_like(total.matrix))
+    return Contributions(slab, total, {CORNERS: replace(total, matrix=rest), **parts})
+
+
+def _sum(parts: dict[str, Covariance]) -> Covariance:
+    first = parts[CORNERS]
+    return replace(first, matrix=sum((part.matrix for part in parts.values()), np.zeros_like(first.matrix)))
 
 
 def _of_kind(slab: Slab, kind: Kind) -> slice:
-    counts = [len(Slab(slab.chamber, (each,), slab.wedge, slab.materials).names) for each in slab.free]
+    counts = [len(replace(slab, free=(each,)).names) for each in slab.free]
     start = sum(counts[: slab.free.index(kind)])
     return slice(start, start + counts[slab.free.index(kind)])
