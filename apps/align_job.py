@@ -30,7 +30,7 @@ from rainstereo.rig import ROLES
 NOTES = ".align"
 CHUNK = 8
 """Pairs that a worker makes in a row, and that one part of the manifest describes."""
-HEADER = ("name", "dry", "wet", "timestamp_us", "drive", "regime", "sync_us")
+HEADER = ("name", "dry", "wet", "timestamp_us", "drive", "regime", "sync_us", "photometric")
 Skip = tuple[str, str]
 """A file, and why it is not in the output."""
 
@@ -60,12 +60,12 @@ class Outputs:
         """Whether all files of a pair are there."""
         return all(imagefile.is_whole(self.path(kind, name)) for kind in self.kinds())
 
-    def row(self, moment: Moment) -> list[str]:
-        """The pair's line in the manifest; what is unknown is empty."""
+    def row(self, moment: Moment, photometric: str) -> list[str]:
+        """The pair's line in the manifest; what is unknown is empty. photometric: what was done to gray levels."""
         when = "" if moment.timestamp_us is None else str(moment.timestamp_us)
         sync = "" if math.isnan(moment.sync_us) else f"{moment.sync_us:g}"
         files = [self.relative(role, moment.name) for role in ROLES]
-        return [moment.name, *files, when, moment.drive, moment.regime, sync]
+        return [moment.name, *files, when, moment.drive, moment.regime, sync, photometric]
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class Work:
                 if len(waiting) > AHEAD:
                     _note(waiting.popleft().result(), part)
                 if stays(i):
-                    waiting.append(hand.submit(self.job.outputs.row, self.source.moment(i)))
+                    waiting.append(hand.submit(self._row, self.source.moment(i)))
                     kept += 1
                     continue
                 try:
@@ -80,7 +80,11 @@ class Work:
                 imagefile.write(outputs.path(kind, moment.name), made, parameters)
         except OSError as error:
             raise _stopped(error) from error
-        return outputs.row(moment)
+        return self._row(moment)
+
+    def _row(self, moment: Moment) -> list[str]:
+        photometric = self.recipe.photometric
+        return self.job.outputs.row(moment, "" if photometric is None else photometric.text)
 
 
 def _note(found: list[str] | Skip, part: Part) -> None:

@@ -19,7 +19,7 @@ Layout = Literal["robotcar", "kitti"]
 CAMERAS = {"robotcar": {"dry": "dry", "wet": "wet"}, "kitti": {"dry": "image_02", "wet": "image_03"}}
 NO_CLOCK_US = 10**15
 """Where pairs that know no time begin: sixteen digits, as RobotCar's names have, so that they sort."""
-HEADER = "name,dry,wet,timestamp_us,drive,regime,sync_us"
+HEADER = "name,dry,wet,timestamp_us,drive,regime,sync_us,photometric"
 
 
 def export(
@@ -57,7 +57,7 @@ def export(
                 write_image(path, pair.frame(role).image if raw else getattr(pair, role))
             paths[role] = path.relative_to(out).as_posix()
         sync = "" if pair.sync_us != pair.sync_us else f"{pair.sync_us:.3f}"
-        rows.append([name, paths["dry"], paths["wet"], stamp, recording.folder.name, pair.regime, sync])
+        rows.append([name, paths["dry"], paths["wet"], stamp, recording.folder.name, pair.regime, sync, ""])
     _write_times(out, folders, layout, stamps)
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([HEADER.split(","), *rows])

@@ -17,8 +17,8 @@ from rainstereo.selection.candidate import Candidate, Measures
 from rainstereo.selection.choose import Selection
 
 COLUMNS = (
-    "name", "dry", "wet", "split", "reserved", "timestamp_us", "time_s", "drive", "regime", "sync_us", "stratum",
-    "cover", "blur_px", "brightness", "clipped", "dark", "moved", "dirt", "hash", "gap_bits",
+    "name", "dry", "wet", "split", "reserved", "timestamp_us", "time_s", "drive", "regime", "sync_us", "photometric",
+    "stratum", "cover", "blur_px", "brightness", "clipped", "dark", "moved", "dirt", "hash", "gap_bits",
 )  # fmt: skip
 LAYOUTS = ("none", "link", "copy")
 Row = dict[str, Any]
@@ -68,7 +68,8 @@ def rows_of(
                 "name": pair.name, "dry": layout.place(pair.dry, pair.name, "dry", split),
                 "wet": layout.place(pair.wet, pair.name, "wet", split), "split": split,
                 "reserved": bool(selection.reserved[k]), "timestamp_us": pair.timestamp_us, "time_s": pair.time,
-                "drive": pair.drive, "regime": pair.regime, "sync_us": pair.sync_us, "stratum": selection.stratum[k],
+                "drive": pair.drive, "regime": pair.regime, "sync_us": pair.sync_us,
+                "photometric": pair.photometric, "stratum": selection.stratum[k],
                 "cover": found.cover, "blur_px": found.blur_px, "brightness": found.brightness,
                 "clipped": found.clipped, "dark": found.dark, "moved": found.moved, "dirt": found.dirt,
                 "hash": found.hash, "gap_bits": float(selection.gap[k]),
@@ -105,7 +106,7 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> str:
         path.unlink(missing_ok=True)  # an older selection's
         return f"it needs a pyarrow that suits this numpy (pip install pyarrow): {error}"
     kinds = {"reserved": pyarrow.bool_(), "timestamp_us": pyarrow.int64()}
-    texts = {"name", "dry", "wet", "split", "drive", "regime", "stratum", "hash"}
+    texts = {"name", "dry", "wet", "split", "drive", "regime", "photometric", "stratum", "hash"}
     schema = pyarrow.schema([(c, kinds.get(c, pyarrow.string() if c in texts else pyarrow.float64())) for c in COLUMNS])
     plain = [{c: _known(row[c]) for c in COLUMNS} for row in rows]
     sink = pyarrow.BufferOutputStream()

@@ -14,7 +14,7 @@ from pathlib import Path
 from rainstereo.pairs import match
 from rainstereo.selection.candidate import Candidate
 
-COLUMNS = ("name", "dry", "wet", "timestamp_us", "drive", "regime", "sync_us")
+COLUMNS = ("name", "dry", "wet", "timestamp_us", "drive", "regime", "sync_us", "photometric")
 MICROSECONDS = re.compile(r"(?<![0-9])([0-9]{16})(?![0-9])")
 """A file's name that holds a moment, as Oxford RobotCar's: microseconds since 1970."""
 
@@ -80,6 +80,7 @@ def _listed(folder: Path) -> list[Candidate]:
                 Candidate(
                     name, _inside(folder, row["dry"]), _inside(folder, row["wet"]), drive, math.nan,
                     _whole(row.get("timestamp_us"), where), row.get("regime") or "", _number(row.get("sync_us"), where),
+                    row.get("photometric") or "",
                 )
             )  # fmt: skip
     return found

@@ -142,7 +142,7 @@ def normal_equations(problem: Problem, observed: Array, panels: Chamber | Panels
     matrix, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
     matrix[:own, :own], gradient[:own] = (tied.T @ tied).toarray(), tied.T @ held
     regularization, total, blocks = matrix.copy(), float(np.sum(held**2)), []
-    for camera in range(len(problem.intrinsics)):
+    for camera in np.unique(problem.indices[:, 1]).tolist():  # a camera may have seen none of the frames
         place, J, off, columns = _rows(problem, observed, panels, camera, layout)
         views = len(place.frames)
         weight = np.maximum(problem.observations[place.rows][..., 2], 0).reshape(views, -1, 1)

@@ -18,6 +18,9 @@ from rainstereo.model.architecture import PUBLISHED
 from rainstereo.model.discriminator import DiscriminatorConfig
 from rainstereo.model.losses import LossWeights
 
+SHIPPED = "shipped"
+"""As a path of weights: those in the package."""
+
 
 @dataclass(frozen=True)
 class Source:
@@ -154,8 +157,9 @@ class Recipe:
     """A run: it ends after `steps`, or, if that comes first, after so many `minutes` (0: no limit).
 
     architecture, network: the generator's name in `architecture` and its options. losses: lambdas, see `losses`; the
-    discriminator is trained only where they need it. vgg: file of VGG-19 weights for the perceptual loss; without it
-    features are random, and labelled so. name, notes: for the card.
+    discriminator is trained only where they need it. start: weights that the generator starts from, a checkpoint or
+    "shipped", whose network it then is unless `network` says so itself; empty: random ones. vgg: file of VGG-19 weights
+    for the perceptual loss; without it features are random, and labelled so. name, notes: for the card.
     """
 
     seed: int = 0
@@ -168,6 +172,7 @@ class Recipe:
     network: Mapping[str, Any] = field(default_factory=dict)
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     losses: LossWeights = field(default_factory=LossWeights)
+    start: str = ""
     vgg: str = ""
     optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
     compute: ComputeOptions = field(default_factory=ComputeOptions)
@@ -261,7 +266,8 @@ def located(recipe: Recipe, folder: Path) -> Recipe:
     data = dataclasses.replace(
         recipe.data, train=tuple(map(source, recipe.data.train)), val=tuple(map(source, recipe.data.val))
     )
-    return dataclasses.replace(recipe, data=data, vgg=at(recipe.vgg))
+    start = recipe.start if recipe.start == SHIPPED else at(recipe.start)
+    return dataclasses.replace(recipe, data=data, start=start, vgg=at(recipe.vgg))
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------

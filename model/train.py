@@ -63,6 +63,8 @@ class Run:
     """Seconds of them in which a step waited for data, since the last start."""
     begun_at: int = 0
     """Steps that had been done at the last start."""
+    begun_share: float = 0.0
+    """`progress` then."""
     best: float = -math.inf
     """PSNR of the best validation."""
     latest: dict[str, float] = field(default_factory=dict)
@@ -99,7 +101,7 @@ def _fit(recipe: Recipe, out: Path, listener: Listener, rank: int, world: int, d
     augmentation = Augmentation(recipe.augment) if on_device else None
     run = Run(recipe, out, Trainer(recipe, device, rank, world), items, validation)
     _resume(run, listener)
-    run.begun_at = run.trainer.done
+    run.begun_at, run.begun_share = run.trainer.done, run.progress
     log = _Table(out / LOSSES, rank == 0)
     log.cut(run.trainer.done)
     validator = _Validator(run, listener, rank == 0, windows)
@@ -290,7 +292,7 @@ def _by_name(recipe: dict[str, Any]) -> dict[str, Any]:
             {**s, "folder": short(s["folder"]), "clear": short(s["clear"]), "rainy": [short(p) for p in s["rainy"]]}
             for s in data[split]
         ]
-    return {**recipe, "data": data, "vgg": Path(recipe["vgg"]).name}
+    return {**recipe, "data": data, "start": short(recipe["start"]), "vgg": Path(recipe["vgg"]).name}
 
 
 def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:

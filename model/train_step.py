@@ -4,22 +4,25 @@ weights."""
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rainstereo.model import checkpoint
 from rainstereo.model.architecture import configure
 from rainstereo.model.dataset import Batch
 from rainstereo.model.losses import GeneratorLoss, discriminator_loss
 from rainstereo.model.pool import DerainedPool
-from rainstereo.model.recipe import Recipe
+from rainstereo.model.recipe import SHIPPED, Recipe
 from rainstereo.model.vgg import VggFeatures
 
 Parts: TypeAlias = list[tuple[Tensor, Tensor]]
@@ -53,12 +56,13 @@ class Trainer:
                 f"optimizer.batch {recipe.optimizer.batch} cannot be shared by {world} processes in "
                 f"{recipe.optimizer.accumulate} parts; give a multiple of {world * recipe.optimizer.accumulate}"
             )
-        self.config = configure(recipe.architecture, recipe.network)
+        started = _started(recipe)
+        self.config = configure(recipe.architecture, recipe.network) if started is None else started.config
         self._format = torch.channels_last if self._may_be_channels_last() else torch.contiguous_format
         self._autocast = PRECISIONS.get(recipe.compute.precision)
         self.scaler = torch.amp.GradScaler(device.type, enabled=self._autocast is torch.float16)
         torch.manual_seed(recipe.seed)
-        self.generator = self._placed(self.config.build())
+        self.generator = self._placed(self.config.build() if started is None else started.build().train())
         self.generator_optimizer = self._adam(self.generator)
         self.average = copy.deepcopy(self.generator).requires_grad_(False) if recipe.optimizer.ema else None
         self.discriminator: nn.Module | None = None
@@ -310,6 +314,28 @@ def instance_norm_differentiates(device: torch.device) -> bool:
         nn.functional.instance_norm(images).backward(slopes.clone(memory_format=order))  # type: ignore[no-untyped-call]
         found.append(images.grad)
     return bool(torch.allclose(found[0], found[1], atol=1e-4))  # type: ignore[arg-type]
+
+
+def _started(recipe: Recipe) -> checkpoint.Checkpoint | None:
+    """The weights that the recipe starts from; ValueError where they are another network's than it describes."""
+    if not recipe.start:
+        return None
+    path = checkpoint.shipped() if recipe.start == SHIPPED else Path(recipe.start)
+    found = checkpoint.load(path)
+    if recipe.architecture != found.architecture:
+        raise ValueError(
+            f"start: {path} holds weights of architecture {found.architecture!r}; the recipe asks for "
+            f"{recipe.architecture!r}"
+        )
+    if not recipe.network:
+        return found
+    theirs, ours = dataclasses.asdict(found.config), dataclasses.asdict(configure(recipe.architecture, recipe.network))
+    other = [f"{key} = {theirs[key]!r}, not {ours[key]!r}" for key in theirs if theirs[key] != ours[key]]
+    if other:
+        raise ValueError(
+            f"start: the network of {path} has {', '.join(other)}; leave [network] out to take it as it is"
+        )
+    return found
 
 
 def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -54,6 +54,12 @@ class Photometric:
         rounded: Image = np.clip(np.rint(shaped), 0, most).astype(image.dtype)
         return rounded
 
+    @property
+    def text(self) -> str:
+        """The map in words, for a manifest: numbers by channel, in the order of the images."""
+        parts = {"gain": self.gain, "offset": self.offset, "vignetting": self.vignetting}
+        return "; ".join(f"{name} {' '.join(f'{value:.6g}' for value in values)}" for name, values in parts.items())
+
     def _for(self, channels: int) -> tuple[Array, Array]:
         if channels == len(self.gain):
             return np.array(self.gain), np.array(self.offset)

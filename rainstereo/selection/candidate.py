@@ -13,6 +13,7 @@ class Candidate:
 
     timestamp_us: None where unknown; `time` then comes from the frame's number. time: seconds, comparable within a
     drive. regime: of the pump, "" unknown. sync_us: from one camera's exposure to the other's, NaN unknown.
+    photometric: how the wet image's gray levels were mapped (`Photometric.text`), "" not.
     """
 
     name: str
@@ -23,6 +24,7 @@ class Candidate:
     timestamp_us: int | None = None
     regime: str = ""
     sync_us: float = math.nan
+    photometric: str = ""
 
 
 @dataclass(frozen=True)

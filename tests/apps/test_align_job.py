@@ -62,8 +62,8 @@ def whole(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, by
 
 def test_the_manifest_lists_every_pair_in_order(drive: Path, whole: dict[str, bytes]) -> None:
     lines = whole["pairs.csv"].decode().splitlines()
-    assert lines[0] == "name,dry,wet,timestamp_us,drive,regime,sync_us"
-    assert lines[1] == f"0000,dry/0000.png,wet/0000.png,,{drive.name},,"
+    assert lines[0] == "name,dry,wet,timestamp_us,drive,regime,sync_us,photometric"
+    assert lines[1] == f"0000,dry/0000.png,wet/0000.png,,{drive.name},,,"
     assert [line.split(",")[0] for line in lines[1:]] == [f"{i:04d}" for i in range(PAIRS)]
     assert len(whole) == 2 * PAIRS + 1
 
@@ -235,6 +235,28 @@ def test_timestamps_and_synchronisation_reach_the_manifest(drive: Path, tmp_path
     assert [row["timestamp_us"] for row in found] == [str(start + 62_500 * i) for i in range(3)]
     assert {(row["drive"], row["sync_us"]) for row in found} == {("2018-08-25", "250")}
     assert (tmp_path / "out" / found[0]["wet"]).is_file()
+
+
+def test_mapped_gray_levels_are_stated_in_the_manifest(drive: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "darker"
+    rng = np.random.default_rng(3)
+    for i in range(3):  # so smooth that the rig's small turn does not matter
+        image = cv2.resize(rng.uniform(20, 230, (5, 6, 3)), (160, 120), interpolation=cv2.INTER_CUBIC).clip(0, 255)
+        for role, seen in (("dry", image), ("wet", 0.8 * image + 5)):
+            (folder / role).mkdir(parents=True, exist_ok=True)
+            imagefile.write(folder / role / f"{i:04d}.png", np.rint(seen).astype(np.uint8))
+    (folder / "rig").symlink_to(drive / "rig")
+    assert main(words(folder, tmp_path / "out", "--photometric")) == 0
+    said = {row["photometric"] for row in rows(tmp_path / "out")}
+    assert len(said) == 1
+    parts = dict(part.strip().split(" ", 1) for part in said.pop().split(";"))
+    assert set(parts) == {"gain", "offset", "vignetting"}
+    assert np.array(parts["gain"].split(), float) == pytest.approx(1 / 0.8, abs=0.05)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())["model"]["photometric"]
+    for name, numbers in parts.items():
+        assert np.array(numbers.split(), float) == pytest.approx(report[name], rel=1e-5)
+    assert main(words(folder, tmp_path / "plain")) == 0
+    assert {row["photometric"] for row in rows(tmp_path / "plain")} == {""}
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ def test_folders_are_recorded_verified_and_exported(folders: Path, tmp_path: Pat
     assert np.array_equal(first, found.read(0).wet)
     assert len((tmp_path / "kitti" / "image_02" / "timestamps.txt").read_text().split("\n")) == 13
     rows = (tmp_path / "robotcar" / "pairs.csv").read_text().split("\n")
-    assert rows[0] == "name,dry,wet,timestamp_us,drive,regime,sync_us"
+    assert rows[0] == "name,dry,wet,timestamp_us,drive,regime,sync_us,photometric"
     assert main(["record", "export", str(out), "--out", str(tmp_path / "raw"), "--raw"]) == 0
     gray = sorted((tmp_path / "raw" / "dry").glob("*.png"))[3]
     assert np.array_equal(read(gray), read(folders / "dry" / "003.png"))

@@ -37,7 +37,8 @@ def aligned(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 imagefile.write(root / f"d{d}" / role / f"{name}.png", image)
             late = 5000 if i == 5 else 20
             lines.append(f"{name},dry/{name}.png,wet/{name}.png,{10**15 + 500_000 * i},night {d},mist,{late}")
-        head = "name,dry,wet,timestamp_us,drive,regime,sync_us"
+        lines = [f"{line},{'gain 1.1; offset 2; vignetting 0 0' if d else ''}" for line in lines]
+        head = "name,dry,wet,timestamp_us,drive,regime,sync_us,photometric"
         (root / f"d{d}" / "pairs.csv").write_text("\n".join([head, *lines]) + "\n")
         (root / f"d{d}" / "wet" / "007.png").write_bytes(b"")
     black = imagefile.read(root / "d0" / "dry" / "009.png") // 30
@@ -70,6 +71,8 @@ def test_folders_become_a_data_set(aligned: Path, tmp_path: Path, capsys: pytest
     assert sum(reason == "incomplete" for reason, _ in reasons) == 3
     assert ("dark", "night 0") in reasons
     assert all("zero bytes" in r["detail"] for r in rest if r["reason"] == "incomplete")
+    mapped = {(row["drive"] != "night 0", row["photometric"]) for row in chosen}
+    assert mapped == {(False, ""), (True, "gain 1.1; offset 2; vignetting 0 0")}
     for row in chosen:
         for role in ("dry", "wet"):
             assert imagefile.read(tmp_path / row[role]).shape == (90, 120, 3)

@@ -172,6 +172,32 @@ def test_another_recipe_is_refused(pairs, tmp_path):
         train(small(pairs, optimizer={"rate": 1e-3}), tmp_path / "a")
 
 
+def test_a_run_starts_from_given_weights(pairs, tmp_path):
+    first, _ = train(small(pairs, steps=2), tmp_path / "a")
+    kept = tmp_path / "a/model.safetensors"
+    table = tables(pairs, start=str(kept), optimizer={"ema": 0.5})
+    other = {**table, "network": {**table["network"], "base_channels": 6}}
+    with pytest.raises(ValueError, match=r"has base_channels = \d+, not 6; leave \[network\] out"):
+        Trainer(recipes.parse(other), torch.device("cpu"))
+    with pytest.raises(ValueError, match="architecture 'generator'; the recipe asks for 'pix2pix'"):
+        Trainer(recipes.parse({**table, "architecture": "pix2pix"}), torch.device("cpu"))
+    del table["network"]
+    begun = Trainer(recipes.parse(table), torch.device("cpu"))
+    assert begun.config == first.trainer.config
+    assert begun.generator.training
+    assert begun.done == 0
+    for module in (begun.generator, begun.average):
+        assert same(module, copied(first.trainer.best))
+
+
+def test_a_run_may_start_from_the_shipped_weights(pairs, tmp_path):
+    from rainstereo.model import checkpoint
+
+    (tmp_path / "r.toml").write_text('start = "shipped"\n[[data.train]]\nfolder = "pairs"\n')
+    found = Trainer(recipes.read(tmp_path / "r.toml"), torch.device("cpu"))
+    assert same(found.generator, checkpoint.load(checkpoint.shipped()).tensors)
+
+
 def test_shifted_pairs_stop_a_run(pairs, tmp_path):
     from rainstereo import imagefile
 
