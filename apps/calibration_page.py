@@ -33,7 +33,8 @@ def page(findings: Findings, record: Record) -> Report:
         reach(report, solution, findings)
         limiting(report, findings)
         agreement(report, solution, findings)
-        capture_next(report, solution, {role: _corners(solution, role) for role in ROLES})
+        corners = {role: _corners(solution, role) for role in ROLES}
+        capture_next(report, solution, findings.observations.board, corners)
         _fit(report, solution)
         _scene(report, solution)
         _frames(report, solution)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from rainstereo.apps.canvas import FAINT, INK, RAIN, SERIES, image_axes, sheet, styled
+from rainstereo.apps.canvas import DRY, FAINT, INK, RAIN, SERIES, image_axes, sheet, styled
 from rainstereo.apps.figures import ladder, same_length
 
 FloatArray = npt.NDArray[np.float64]
@@ -110,4 +110,34 @@ def depth_sigmas(depths: npt.ArrayLike, sigmas: Mapping[str, npt.ArrayLike]) -> 
     axes.tick_params(which="minor", length=0)
     axes.annotate("in the middle of the dry image", (0, 1), (0, 5), "axes fraction", textcoords="offset points",
                   color=FAINT, fontsize=8.5)  # fmt: skip
+    return figure
+
+
+@styled
+def where_to_hold(
+    corners: Mapping[str, npt.ArrayLike],
+    outlines: Mapping[str, npt.ArrayLike],
+    meshes: Mapping[str, Sequence[npt.ArrayLike]],
+    sizes: Mapping[str, tuple[int, int]],
+) -> Figure:
+    """A board drawn into each camera's image as it should be held, over the corners seen so far.
+
+    corners : role -> (..., 2) pixels, NaN = not observed. outlines : role -> (N, 2), the edge of the print.
+    meshes : role -> lines (N, 2) between squares, which show how it leans. sizes : role -> (width, height).
+    """
+    roles = list(outlines)
+    width, height = sizes[roles[0]]
+    figure, grid = sheet(9.2, 4.6 * height / width + 0.5, 1, len(roles), squeeze=False)
+    for axes, role in zip(grid[0], roles, strict=True):
+        xy = np.asarray(corners[role], float).reshape(-1, 2)
+        axes.plot(*xy[np.isfinite(xy).all(1)].T, ".", ms=1.6, color=FAINT, alpha=0.6, rasterized=len(xy) > 4000)
+        edge = np.asarray(outlines[role], float)
+        axes.fill(*edge.T, facecolor=DRY, edgecolor=DRY, alpha=0.25)
+        axes.plot(*np.concatenate([edge, edge[:1]]).T, color=DRY, lw=2.2)
+        for line in meshes[role]:
+            axes.plot(*np.asarray(line, float).T, color=DRY, lw=0.8)
+        image_axes(axes, sizes[role])
+        axes.grid(False)
+        axes.set_title(f"{role} camera", fontsize=9)
+        axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     return figure
