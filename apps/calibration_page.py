@@ -70,11 +70,15 @@ def _verdict(report: Report, findings: Findings) -> None:
 def _tiles(report: Report, solution: Solution, findings: Findings) -> None:
     sigma, deep = findings.baseline_sigma(), findings.made_of.get("depth at 2 m", {})
     report.tiles(
-        Tile("RMS per coordinate", quantity(solution.rms_px), "px", "inliers; per point: x 1.41"),
+        Tile(
+            "RMS per coordinate",
+            quantity(solution.rms_px),
+            "px",
+            f"{solution.outlier_count} of {solution.corner_count} corners rejected",
+        ),
         Tile("baseline", f"{1000 * solution.rig.baseline:.3f}", "mm", f"+- {quantity(1000 * sigma, 'mm', 2)}"),
         Tile("at infinity", quantity(findings.infinity[STEREO].typical, digits=2), "px", "wet against dry, one sigma"),
         Tile("depth at 2 m", quantity(float(np.sqrt(sum(deep.values()))), digits=2), "mm", "one sigma, one match"),
-        Tile("pairs", len(solution.names), "", f"{solution.outlier_count} of {solution.corner_count} corners rejected"),
         Tile("lens model", solution.lensmodel.removeprefix("LENSMODEL_").split("_")[0], "", _acrylic(solution)),
     )
 

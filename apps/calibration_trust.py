@@ -108,18 +108,13 @@ def agreement(report: Report, solution: Solution, findings: Findings) -> None:
         )
     rows = []
     for each in findings.comparisons:
-        cells: list[str | float] = []
-        for d in DISTANCES:
-            found = each.at(d)
-            cells += [float("nan")] * 3 if found is None else [found.found, found.expected, round(found.ratio, 2)]
+        compared = [each.at(d) for d in DISTANCES]
+        cells = ["–" if d is None else f"{quantity(d.found, 'px', 2)} ({d.ratio:.1f} x)" for d in compared]
         rows.append((each.name + (f": {each.failure}" if each.failure else ""), *cells))
-    header = ["frames"]
-    for d in DISTANCES:
-        header += [f"{distance_words(d)}: found, px", "expected, px", "ratio"]
     report.table(
-        header,
+        ("frames", *(distance_words(d) for d in DISTANCES)),
         rows,
-        "Medians over the image; the ratio is the root mean square in units of what is expected at each pixel. "
-        "1 is what noise of the corners does; 2 and more is more than chance.",
-        numbers=range(1, len(header)),
+        "Median over the image; in brackets the root mean square in units of what noise of the corners does at each "
+        "pixel: about 1 where it is all there is; 2 and more is more than chance.",
+        numbers=range(1, 1 + len(DISTANCES)),
     )

@@ -48,6 +48,6 @@ def _proposal(report: Report, solution: Solution, board: Board, corners: dict[st
     sizes = {role: solution.rig.camera(role).size for role in ROLES}
     report.figure(
         trust_figures.where_to_hold(corners, best.outlines, best.mesh, sizes),
-        f"The pose that would help most: {best.words} ({best.distance:.2f} m away). It takes the least certain far "
+        f"The pose that would help most: {best.words}. It takes the least certain far "
         f"direction {change}; chosen from {best.considered} poses. Dots are the corners seen so far.",
     )
