@@ -16,6 +16,7 @@ from rainstereo.apps.calibration_findings import (
     limits,
 )
 from rainstereo.apps.report import Report, quantity
+from rainstereo.calib import consistency
 from rainstereo.calib.solve import Solution
 
 REMEDIES = {
@@ -96,7 +97,8 @@ def agreement(report: Report, solution: Solution, findings: Findings) -> None:
         "Does it agree with itself",
         "The calibration repeated on parts of its frames. The maps above trust the model; these do not: a difference "
         "well above what corner noise accounts for means that something is not as the model has it."
-        + (f" The largest is {worst:.1f} times that." if done else ""),
+        + (f" The largest is {worst:.1f} times that." if done else "")
+        + (" The sigmas on this page are too small by as much." if worst > consistency.BEYOND_NOISE else ""),
     )
     if done:
         maps = [{each.name.split(" (")[0]: np.sqrt(each.differences[0].square)} for each in done]

@@ -18,7 +18,7 @@ import numpy as np
 from rainstereo import pose, refraction
 from rainstereo.calib import adjust, joint, range_uncertainty, through_acrylic, uncertainty
 from rainstereo.calib import mrcal_versions as versions
-from rainstereo.calib.checks import Finding
+from rainstereo.calib.checks import INFINITY_DOUBTFUL_PX, Finding, Severity
 from rainstereo.calib.mrcal_versions import Problem, SolveError
 from rainstereo.calib.refracted import Panels
 from rainstereo.calib.slab import Slab
@@ -36,7 +36,7 @@ FEWEST = 4
 BANDS = ("nearest", "middle", "farthest")
 LITTLE = 1e-4
 """Where less than this share of the largest variance is expected, variances of a part and of the whole cancelled."""
-DOUBTFUL_RATIO, DOUBTFUL_PX = 2.0, 0.03
+BEYOND_NOISE, NOTICED_PX = 2.0, 0.03
 """Noise alone seldom differs by twice what it should, and what is smaller than this harms nobody."""
 REMEDY = (
     "something is not as the model has it: check that the panels are given and their figures right, that the board is "
@@ -123,18 +123,22 @@ def compare(
 
 
 def doubts(comparisons: Sequence[Comparison]) -> list[Finding]:
-    """Where parts of a capture differ by more than DOUBTFUL_RATIO of what noise explains, and by DOUBTFUL_PX."""
+    """Where parts of a capture differ by more than noise explains; a doubt where that is a lot, else a note.
+
+    A lot is what is a lot for a predicted uncertainty, too: real lenses and boards always differ a little from models.
+    """
     found = []
     for each in comparisons:
-        beyond = [d for d in each.differences if d.ratio > DOUBTFUL_RATIO and d.found > DOUBTFUL_PX]
+        beyond = [d for d in each.differences if d.ratio > BEYOND_NOISE and d.found > NOTICED_PX]
         if beyond:
             worst = max(beyond, key=lambda d: d.ratio)
+            severity: Severity = "doubtful" if max(d.found for d in beyond) > INFINITY_DOUBTFUL_PX else "note"
             where = "at infinity" if np.isinf(worst.distance) else f"at {worst.distance:g} m"
             text = (
                 f"{each.name}: the wet pixel that belongs to a dry pixel {where} differs by {worst.found:.2f} px, "
                 f"{worst.ratio:.1f} times what noise of the corners explains"
             )
-            found.append(Finding("doubtful", text, REMEDY))
+            found.append(Finding(severity, text, REMEDY))
     return found
 
 

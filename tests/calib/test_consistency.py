@@ -49,8 +49,21 @@ def test_ignored_panels_show_although_the_residuals_hide_them(through: Solution)
     assert "nearest" in nearest.name
     assert max(d.ratio for d in nearest.differences) > 2
     (doubt, *_) = consistency.doubts(compared)
-    assert doubt.severity == "doubtful"
+    assert "times what noise of the corners explains" in doubt.text
     assert "panels" in doubt.remedy
+
+
+def test_what_is_small_is_noted_and_what_is_large_is_doubted() -> None:
+    pixels, expected = np.zeros((2, 2, 2)), np.full((2, 2), 1e-4)
+    severities = []
+    for length in (0.005, 0.1, 1.0):
+        difference = consistency.Difference(np.inf, pixels, np.full((2, 2, 2), length / np.sqrt(2)), expected)
+        assert difference.found == pytest.approx(length)
+        assert difference.ratio == pytest.approx(length / 0.01)
+        severities.append(
+            [f.severity for f in consistency.doubts([consistency.Comparison("x", (4, 4), (difference,))])]
+        )
+    assert severities == [[], ["note"], ["doubtful"]]
 
 
 def test_a_part_is_what_solving_it_alone_gives(through: Solution) -> None:
