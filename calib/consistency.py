@@ -20,6 +20,7 @@ from rainstereo.calib import adjust, range_uncertainty, through_acrylic, uncerta
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.checks import Finding
 from rainstereo.calib.mrcal_versions import Problem, SolveError
+from rainstereo.calib.refracted import Panels
 from rainstereo.calib.solve import Solution
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
@@ -144,9 +145,12 @@ def part(solution: Solution, kept: Mask) -> Solution:
     if chamber is None:
         versions.optimize(problem)
     else:
-        shift = through_acrylic.shift(solution.problem, chamber)
+        panels = Panels.of(chamber if solution.panels is None else solution.panels)
+        shift = through_acrylic.shift(solution.problem, panels)
         seen = (solution.problem.observations[..., :2] + shift)[kept[solution.problem.indices[:, 0]]]
-        through_acrylic.refine(problem, seen, chamber)
+        own = panels.kept(kept)
+        through_acrylic.refine(problem, seen, own)
+        solution = replace(solution, panels=own, estimate=None)
     return replace(solution, problem=problem, rig=_rig(problem, chamber), rt_ref_board=problem.rt_ref_board)
 
 

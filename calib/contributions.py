@@ -19,6 +19,7 @@ from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib import refracted, through_acrylic, uncertainty
 from rainstereo.calib import slab as slabs
 from rainstereo.calib.mrcal_versions import Problem
+from rainstereo.calib.refracted import Panels
 from rainstereo.calib.slab import Kind, Slab
 from rainstereo.calib.solve import Solution
 from rainstereo.calib.uncertainty import Covariance
@@ -107,8 +108,10 @@ def described(slab: Slab) -> Array:
 def _response(solution: Solution, slab: Slab) -> tuple[Covariance, Array]:
     """Covariance of mrcal's state from corner noise, through the panels, and how it moves with their parameters."""
     problem = solution.problem
-    seen = problem.observations[..., :2] + through_acrylic.shift(problem, slab.chamber)
-    normal, at = refracted.normal_equations(problem, seen, slab.chamber), versions.linearize(problem)
+    given = Panels.of(slab.chamber if solution.panels is None else solution.panels)
+    panels = given.kept(np.ones(len(problem.rt_ref_board), dtype=np.bool_))
+    seen = problem.observations[..., :2] + through_acrylic.shift(problem, panels)
+    normal, at = refracted.normal_equations(problem, seen, panels), versions.linearize(problem)
     inverse, condition = uncertainty.regular_inverse(normal.matrix)
     tied = at.jacobian[at.boards :]
     corners = normal.matrix - (tied.T @ tied).toarray()
@@ -120,6 +123,7 @@ def _response(solution: Solution, slab: Slab) -> tuple[Covariance, Array]:
     cross = np.zeros((len(matrix), len(slab.names)))
     for camera, (J, columns) in enumerate(normal.blocks):
         by_slab = _by_slab(problem, slab, camera)
+        by_slab[~panels.behind(problem.indices[problem.indices[:, 1] == camera, 0])] = 0
         np.add.at(cross, columns, np.swapaxes(J, 1, 2) @ by_slab)
     moved = -(inverse @ cross) * at.scale[:, None]
     return Covariance((matrix + matrix.T) / 2, versions.layout(problem), sigma, condition), moved
