@@ -115,8 +115,8 @@ def _wedge(solution: Solution, table: Sequence[Hypothesis]) -> list[Finding]:
 def _wedged(solution: Solution, wedge: float, sigma: float, slab: Slab) -> Finding:
     pixels = (slab.chamber.panels[0].index - 1) * wedge * float(solution.rig.dry.intrinsics[0])
     text = (
-        f"the panels' faces are not parallel: a wedge of {math.degrees(wedge):.3f} +- {math.degrees(sigma):.3f} degrees "
-        f"in all turns far directions by {pixels:.2f} px, alike for both cameras; the rig has no wedge in it"
+        f"the panels' faces are not parallel: a wedge of {math.degrees(wedge):.3f} +- {math.degrees(sigma):.3f} "
+        f"degrees in all turns far directions by {pixels:.2f} px, alike for both cameras; the rig has no wedge in it"
     )
     return Finding("doubtful", text, "use cast sheets of even thickness; where only the pairs matter it may stay")
 

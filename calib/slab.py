@@ -13,8 +13,8 @@ minus the near face's. To first order in W a ray of direction d (unit, c = d.n) 
     d - g(c) (W - (W.d / c) n),    g(c) = sqrt(N^2 - 1 + c^2) - c
 
 (Snell's law at both faces: N s = d + g1 n1, d' = N s - g2 n2), so a point that without the wedge seems to be at P'
-seems to be at P' + L g(c) (W - (W.d / c) n), with L the length of the ray behind the wedge. Wedges of several panels add
-up; it is taken to stand in the middle of the stack.
+seems to be at P' + L g(c) (W - (W.d / c) n), with L the length of the ray behind the wedge. Wedges of several panels
+add up; it is taken to stand in the middle of the stack.
 """
 
 from __future__ import annotations

@@ -129,5 +129,5 @@ def _frame_squares(problem: Problem) -> Array:
 
 
 def seen_through(problem: Problem, panels: Panels | Chamber) -> Array:
-    """The corners as detected, (M, rows, columns, 2), of a problem whose observations had the panels' shift taken off."""
+    """The corners as detected, (M, rows, columns, 2), of a problem that the panels' shift was taken off."""
     return np.asarray(problem.observations[..., :2] + through_acrylic.shift(problem, panels))
