@@ -8,19 +8,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from rainstereo import Chamber
+from rainstereo.apps.calibration_captures import Captures, check, gather
 from rainstereo.apps.calibration_findings import Findings, distance_words
 from rainstereo.apps.calibration_page import page
+from rainstereo.apps.calibration_slab import slab_results
 from rainstereo.apps.cli import DONE, FAILED
 from rainstereo.apps.run_record import Record
-from rainstereo.calib import checks, consistency, mrcal_versions, uncertainty
+from rainstereo.calib import checks, consistency, mrcal_versions, panel_checks, uncertainty
 from rainstereo.calib.board import Board
 from rainstereo.calib.cross_validation import choose_lensmodel
+from rainstereo.calib.hypotheses import Hypothesis, compare
 from rainstereo.calib.mrcal_versions import SolveError
-from rainstereo.calib.observations import Observations
 from rainstereo.calib.solve import Solution, solve
 from rainstereo.pose import invert
 from rainstereo.rig import ROLES
@@ -39,7 +41,8 @@ class Options:
     out: Path
     """Rig folder to write: dry.cameramodel, wet.cameramodel, chamber.toml, report.html, report.json."""
     dry: str = ""
-    """Board images of the dry camera: a folder, or a quoted glob such as 'boards/left*.png'."""
+    """Board images of the dry camera: a folder, or a quoted glob such as 'boards/left*.png'. With a folder as
+    --chamber, what they are called within it; 'dry' by default."""
     wet: str = ""
     """Board images of the wet camera; files are paired by name (left01 with right01, 0007 with 0007)."""
     watch: Path | None = None
@@ -53,7 +56,17 @@ class Options:
     port: int = 8417
     """With --watch: port of the page on this machine (127.0.0.1); 0 for any that is free."""
     chamber: Path | None = None
-    """The panels that both cameras look through, as a chamber.toml; without it they are taken to look through air."""
+    """The panels that both cameras look through, as a chamber.toml; without it they are taken to look through air. Or a
+    folder of images taken through them, with dry/ and wet/ in it and the chamber.toml."""
+    bare: Path | None = None
+    """Paired captures: a folder of images taken without the chamber, beside --chamber DIR of those with it. Tilt and
+    thickness are then found by the boards alone. Leave rig and board where they are while the chamber goes in, and call
+    both images alike: such pairs tell most by far."""
+    panels: Path | None = None
+    """The chamber.toml, where it is not in the folder that --chamber names."""
+    slab: Literal["known", "estimated"] = "known"
+    """known: the panels are as chamber.toml says, and its standard deviations count as uncertainty. estimated: they are
+    improved by what the corners say (a diagnosis; a caliper is mostly better). Paired captures do not need it."""
     lensmodel: str = "auto"
     """auto: chosen by cross-validation; or LENSMODEL_OPENCV4, 5, 8, 12, or splined."""
     expected_baseline_mm: float | None = None
@@ -74,30 +87,26 @@ def run(options: Options) -> int:
         from rainstereo.apps import watch
 
         return watch.run(options)
-    if not (options.dry and options.wet):
-        raise ValueError("give the board images of both cameras: --dry DIR --wet DIR, or --watch DIR while capturing")
+    chamber = check(options)
     record = Record("calibrate", options)
     board = Board.parse(options.board)
-    chamber = None if options.chamber is None else Chamber.load(options.chamber)
     mrcal_versions.load()  # rather than find out after the search that it is missing
     clock = Clock()
-    with progress("looking for the board") as step:
-        observations = Observations.from_folders(
-            options.dry, options.wet, board, progress=step, workers=options.workers, cache=options.cache
-        )
+    captures = gather(options, board, chamber, progress)
+    observations = captures.observations
     clock("detection")
     print(f"{len(observations)} pairs show the board ({len(observations.rejected)} files left out)")
-    return finish(options, record, examine(options, observations, chamber, clock), clock)
+    return finish(options, record, examine(options, captures, clock), clock)
 
 
-def examine(options: Options, observations: Observations, chamber: Chamber | None, clock: Clock) -> Findings:
+def examine(options: Options, captures: Captures, clock: Clock) -> Findings:
     """Choose a lens model where none is given, solve, and judge the result."""
-    choice = None
+    observations, chamber, choice = captures.observations, captures.described, None
     try:
         if options.lensmodel == "auto":
-            choice = choose_lensmodel(observations, chamber=chamber)
+            choice = choose_lensmodel(captures.choice[0], chamber=captures.choice[1])
             clock("choice of lens model")
-        solution = solve(observations, choice.lensmodel if choice else options.lensmodel, chamber)
+        solution = solve(observations, choice.lensmodel if choice else options.lensmodel, captures.through)
         clock("solve")
     except SolveError as error:
         verdict = checks.judge_failure(observations, error, FALLBACK)
@@ -108,12 +117,17 @@ def examine(options: Options, observations: Observations, chamber: Chamber | Non
         observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance
     )
     clock("uncertainty and checks")
+    hypotheses: tuple[Hypothesis, ...] = ()
+    if chamber is not None and chamber.panels:
+        hypotheses = compare(solution, chamber)
+        verdict = checks.Verdict((*verdict.findings, *panel_checks.panels(solution, chamber, hypotheses)))
+        clock("hypotheses about the panels")
     comparisons = None
     if options.cross_validate:
         comparisons = consistency.compare(solution)
         verdict = checks.Verdict((*verdict.findings, *consistency.doubts(comparisons)))
         clock("cross-validation")
-    return Findings(observations, solution, covariance, choice, verdict, chamber, comparisons)
+    return Findings(observations, solution, covariance, choice, verdict, chamber, comparisons, hypotheses)
 
 
 class Clock:
@@ -240,5 +254,6 @@ def results(findings: Findings, clock: Clock) -> dict[str, object]:
         "reordered": solution.reordered,
         "board_warp_m": solution.calobject_warp,
         "refraction": solution.passes,
+        "panels": slab_results(findings),
         "solve_seconds": solution.solve_seconds,
     }

@@ -14,6 +14,7 @@ from rainstereo.calib.checks import Verdict
 from rainstereo.calib.consistency import Comparison
 from rainstereo.calib.contributions import CORNERS, Contributions
 from rainstereo.calib.cross_validation import Choice
+from rainstereo.calib.hypotheses import Hypothesis
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.solve import Solution
 from rainstereo.calib.uncertainty import Covariance, UncertaintyMap
@@ -35,7 +36,8 @@ def distance_words(distance: float) -> str:
 class Findings:
     """All that a calibration found out; `solution` and what hangs on it are None where it failed.
 
-    comparisons: of parts of the capture with each other; None where that was not asked for.
+    comparisons: of parts of the capture with each other; None where that was not asked for. hypotheses: about the
+    panels; empty where there are none.
     """
 
     observations: Observations
@@ -45,6 +47,7 @@ class Findings:
     verdict: Verdict
     chamber: Chamber | None
     comparisons: tuple[Comparison, ...] | None = None
+    hypotheses: tuple[Hypothesis, ...] = ()
 
     @cached_property
     def spread(self) -> Contributions | None:

@@ -7,6 +7,7 @@ import numpy as np
 from rainstereo import Chamber, Rig
 from rainstereo.apps import figures
 from rainstereo.apps.calibration_findings import STEREO, Findings
+from rainstereo.apps.calibration_slab import slab_section
 from rainstereo.apps.calibration_trust import agreement, limiting, reach
 from rainstereo.apps.capture_next import capture_next
 from rainstereo.apps.report import Mood, Report, Tile, quantity
@@ -32,6 +33,7 @@ def page(findings: Findings, record: Record) -> Report:
         _tiles(report, solution, findings)
         reach(report, solution, findings)
         limiting(report, findings)
+        slab_section(report, solution, findings)
         agreement(report, solution, findings)
         corners = {role: _corners(solution, role) for role in ROLES}
         capture_next(report, solution, findings.observations.board, corners)

@@ -32,7 +32,7 @@ SURE = 1e-3
 class Hypothesis:
     """One row of the table.
 
-    parameters: of the panels that the corners decide. chi2: sum of squares over the noise squared. rms_px: of the inliers.
+    parameters: of the panels that the corners decide. chi2: sum of squares over the noise squared. rms_px: of inliers.
     against: the poorer hypothesis that it is compared with, by `gain`, chi2 that it saves, `freedom`, and `p`, the
     probability of so much if the poorer is true; None for the first. values, sigmas: of what is free, SI units.
     problem: why there is no answer, "" where there is one.

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rainstereo.calib import refracted, through_acrylic
 from rainstereo.calib import mrcal_versions as versions
+from rainstereo.calib import refracted, through_acrylic
 from rainstereo.calib.mrcal_versions import Problem
 from rainstereo.calib.prior import Prior
 from rainstereo.calib.refracted import Normal, Panels

@@ -46,7 +46,9 @@ def panels(solution: Solution, described: Chamber, table: Sequence[Hypothesis] =
     found = questions(described)
     if solution.moved:
         text = "board or rig moved while the panels were put in: these do not share a pose with their partners"
-        found.append(Finding("note", text, "leave board and rig where they are between the two captures", solution.moved))
+        found.append(
+            Finding("note", text, "leave board and rig where they are between the two captures", solution.moved)
+        )
     found += _contradictions(solution)
     found += _unknown(solution)
     found += _wedge(solution, table)
@@ -113,20 +115,21 @@ def _wedge(solution: Solution, table: Sequence[Hypothesis]) -> list[Finding]:
 def _wedged(solution: Solution, wedge: float, sigma: float, slab: Slab) -> Finding:
     pixels = (slab.chamber.panels[0].index - 1) * wedge * float(solution.rig.dry.intrinsics[0])
     text = (
-        f"the panels' faces are not parallel: a wedge of {math.degrees(wedge):.3f} +- {math.degrees(sigma):.3f} degrees "
-        f"in all turns far directions by {pixels:.2f} px, alike for both cameras; the rig has no wedge in it"
+        f"the panels' faces are not parallel: a wedge of {math.degrees(wedge):.3f} +- {math.degrees(sigma):.3f} "
+        f"degrees in all turns far directions by {pixels:.2f} px, alike for both cameras; the rig has no wedge in it"
     )
     return Finding("doubtful", text, "use cast sheets of even thickness; where only the pairs matter it may stay")
 
 
 def _tests(solution: Solution, table: Sequence[Hypothesis]) -> list[Finding]:
-    rows, found = {row.name: row for row in table}, []
-    for row in table:
-        if row.problem:
-            found.append(Finding("note", f"{row.name}: {row.problem}"))
+    rows: dict[str, Hypothesis] = {row.name: row for row in table}
+    found: list[Finding] = []
+    found += [Finding("note", f"{row.name}: {row.problem}") for row in table if row.problem]
     known = rows.get(KNOWN)
     if known is not None and not known.problem and known.gain < 0:
-        text = f"the corners fit better without any panels than with those described (chi-squared {-known.gain:.0f} less)"
+        text = (
+            f"the corners fit better without any panels than with those described (chi-squared {-known.gain:.0f} less)"
+        )
         found.append(Finding("doubtful", text, "check that these images were taken through the panels"))
     better = rows.get(ESTIMATED)
     if better is not None and better.rejects and solution.estimate is None:

@@ -1,4 +1,4 @@
-"""What is known of the panels before a board is seen: a caliper's thickness, a measured tilt, an index from a data sheet.
+"""What is known of the panels before a board is seen: a caliper's thickness, a measured tilt, a data sheet's index.
 
 Each is a normal distribution about the described value. Written as rows of a least-squares problem, in standard
 deviations, they join the corners' rows.
@@ -71,7 +71,9 @@ class Prior:
     def pulls(self, slab: Slab) -> dict[str, float]:
         """By how many of the description's sigmas the slab departs from it, for each parameter that is described."""
         known = np.isfinite(self.sigmas(slab))
-        return {name: float(off) for name, off, there in zip(slab.names, self.rows(slab)[0], known, strict=True) if there}
+        return {
+            name: float(off) for name, off, there in zip(slab.names, self.rows(slab)[0], known, strict=True) if there
+        }
 
 
 def _departure(described: Chamber, slab: Slab) -> tuple[Array, Array]:

@@ -9,11 +9,12 @@ what is known of the panels beforehand joins as rows of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from rainstereo import pose
+from rainstereo import pose, types
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib import slab as slabs
 from rainstereo.calib.mrcal_versions import Layout, Problem, SolveError
@@ -52,9 +53,14 @@ class Panels:
         """Panels as they are; a chamber stands for panels in front of all frames with nothing free."""
         return given if isinstance(given, Panels) else cls(Slab(given))
 
-    def behind(self, frames: Array) -> Mask:
+    def behind(self, frames: np.ndarray[Any, np.dtype[np.integer[Any]]]) -> Mask:
         """For each of these frames whether it was taken through the panels."""
         return np.ones(len(frames), dtype=np.bool_) if self.frames is None else np.asarray(self.frames[frames])
+
+    def kept(self, which: Mask) -> Panels:
+        """The panels as they are for a part of the frames, (F,) true; nothing free, and no pose shared."""
+        frames = None if self.frames is None else self.frames[which]
+        return Panels(replace(self.slab, free=()), frames)
 
     def spread(self, layout: Layout, array: Array) -> Array:
         """An array whose first axis is the state, with the poses of frames that share another's copied from there."""
@@ -99,7 +105,7 @@ class Normal:
 def pixels(problem: Problem, panels: Chamber | Panels) -> Array:
     """Where the cameras see each corner through the panels at the problem's state, (M, rows, columns, 2).
 
-    A chamber is given in the frame of the problem's first camera. ChamberError if a corner that takes part cannot be seen.
+    A chamber is given in the frame of the problem's first camera. ChamberError if a corner that takes part is hidden.
     """
     panels = Panels.of(panels)
     seen = np.zeros((*problem.observations.shape[:3], 2))
@@ -173,9 +179,7 @@ def _rows(
     R, rt, frames, views = place.R, place.rt, place.frames, len(place.frames)
     apparent, moved, by_slab, by_centre = _moved(panels, place)
     count = apparent.shape[1]
-    seen, by_point, by_lens = versions.project_gradients(
-        apparent @ R.T, problem.lensmodel, problem.intrinsics[camera]
-    )
+    seen, by_point, by_lens = versions.project_gradients(apparent @ R.T, problem.lensmodel, problem.intrinsics[camera])
     by_apparent = by_point @ R
     by_reference = by_apparent @ moved
     parts: list[Array] = [by_lens[..., layout.intrinsics_columns]]
@@ -206,7 +210,7 @@ def _rows(
 
 
 def _moved(panels: Panels, place: _Place) -> tuple[Array, Array, Array, Array | None]:
-    """Where the corners of a camera's views seem to be, (V, N, 3), and derivatives by point, slab and camera's centre."""
+    """Where the corners of a camera's views seem to be, (V, N, 3), and derivatives by point, slab and centre."""
     u = place.centred()
     u = u.reshape(len(u), -1, 3)
     behind = panels.behind(place.frames)
@@ -246,7 +250,7 @@ class _Place:
         return np.asarray(np.einsum("fij,rcj->frci", R, board) + t[:, None, None])
 
 
-def _require_seen(place: _Place, panels: Panels, behind: Mask, u: Array, status: Array) -> None:
+def _require_seen(place: _Place, panels: Panels, behind: Mask, u: Array, status: types.Status) -> None:
     weight = place.problem.observations[place.rows][behind][..., 2].reshape(status.shape)
     hidden = (weight > 0) & (status != Status.SEEN)
     if hidden.any():

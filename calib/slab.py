@@ -12,9 +12,9 @@ minus the near face's. To first order in W a ray of direction d (unit, c = d.n) 
 
     d - g(c) (W - (W.d / c) n),    g(c) = sqrt(N^2 - 1 + c^2) - c
 
-(Snell's law at both faces: N s = d + g1 n1, d' = N s - g2 n2), so a point that without the wedge seems to be at P' seems
-to be at P' + L g(c) (W - (W.d / c) n), with L the length of the ray behind the wedge. Wedges of several panels add
-up; it is taken to stand in the middle of the stack.
+(Snell's law at both faces: N s = d + g1 n1, d' = N s - g2 n2), so a point that without the wedge seems to be at P'
+seems to be at P' + L g(c) (W - (W.d / c) n), with L the length of the ray behind the wedge. Wedges of several panels
+add up; it is taken to stand in the middle of the stack.
 """
 
 from __future__ import annotations
@@ -247,7 +247,7 @@ def _seen_from(slab: Slab, centre: Array) -> Chamber:
 
 
 def _deviation(slab: Slab, seen: Array, centre: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """How the wedge moves points seen at P', (N, 3), and derivatives: by P' (N, 3, 3), by the normal (N, 3, 3; the wedge
+    """How the wedge moves points seen at P', (N, 3), and derivatives: by P', by the normal (N, 3, 3; the wedge is
     carried along), by the index of the first material (N, 3), by W, by the camera's centre (N, 3, 3).
     """  # fmt: skip
     n, W, N = np.asarray(slab.chamber.normal), np.asarray(slab.wedge), slab.chamber.panels[0].index

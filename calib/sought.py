@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
+from rainstereo import pose
 from rainstereo.calib import joint, outliers, through_acrylic
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.adjust import Adjustment
@@ -20,6 +21,8 @@ from rainstereo.types import Array, Indices, Mask
 
 MOVED = float(scipy.stats.chi2.isf(1e-6, 6))
 """A tie of two poses that costs more squared sigmas than this is no tie: board or rig moved in between."""
+ELSEWHERE = 0.02
+"""Metres between two places of a corner that wrongly described panels do not explain."""
 WEDGED = float(scipy.stats.chi2.isf(1e-6, 2))
 """A wedge that explains as many squared sigmas is there."""
 ROUNDS = 8
@@ -60,6 +63,9 @@ def find(adjustment: Adjustment, sought: Sought, noise_px: float) -> tuple[Panel
     panels.noise_px = noise_px
     apart = _frame_squares(adjustment.problem)
     seen, loose = adjustment.seen(), np.zeros(len(adjustment.frames), dtype=np.bool_)
+    if panels.ties is not None:
+        loose = _elsewhere(adjustment.problem, panels.ties)
+        panels.ties = np.where(loose, np.arange(len(loose)), panels.ties).astype(np.intp)
     for _ in range(ROUNDS):
         estimate = joint.estimate(adjustment.problem, seen, panels)
         fresh = _moved(adjustment.problem, panels, apart, noise_px)
@@ -85,9 +91,22 @@ def _with_wedge(problem: Problem, seen: Array, panels: Panels, without: Estimate
     gained = (before - joint.corner_square(trial, seen, wedged)) / found.covariance.sigma**2
     if gained <= WEDGED:
         return panels, without
-    problem.intrinsics, problem.rt_cam_ref, problem.rt_ref_board = trial.intrinsics, trial.rt_cam_ref, trial.rt_ref_board
+    problem.intrinsics, problem.rt_cam_ref, problem.rt_ref_board = (
+        trial.intrinsics,
+        trial.rt_cam_ref,
+        trial.rt_ref_board,
+    )
     problem.warp, problem.observations = trial.warp, trial.observations
     return wedged, found
+
+
+def _elsewhere(problem: Problem, ties: Indices) -> Mask:
+    """Which frames show the board plainly in another place than their partners do, (F,)."""
+    rows, columns = problem.observations.shape[1:3]
+    points = versions.board_points(rows, columns, problem.spacing).reshape(-1, 3)
+    R, t = pose.rotation_matrix(problem.rt_ref_board[:, :3]), problem.rt_ref_board[:, None, 3:]
+    placed = np.einsum("fij,nj->fni", R, points) + t
+    return np.asarray(np.linalg.norm(placed - placed[ties], axis=-1).max(-1) > ELSEWHERE)
 
 
 def _moved(problem: Problem, panels: Panels, apart: Array, noise_px: float) -> Mask:
@@ -110,5 +129,5 @@ def _frame_squares(problem: Problem) -> Array:
 
 
 def seen_through(problem: Problem, panels: Panels | Chamber) -> Array:
-    """The corners as detected, (M, rows, columns, 2), of a problem whose observations had the panels' shift taken off."""
+    """The corners as detected, (M, rows, columns, 2), of a problem that the panels' shift was taken off."""
     return np.asarray(problem.observations[..., :2] + through_acrylic.shift(problem, panels))

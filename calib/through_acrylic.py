@@ -49,7 +49,7 @@ class Passes:
 def shift(problem: Problem, panels: Chamber | Panels) -> Array:
     """Pixels by which the panels move each corner at the problem's state, (M, rows, columns, 2); 0 where unseen.
 
-    A chamber is given in the frame of the problem's first camera. ChamberError where a corner cannot be seen through it.
+    A chamber is given in the frame of the problem's first camera. ChamberError where a corner is hidden by it.
     """
     moved = refracted.pixels(problem, panels) - refracted.bare_pixels(problem)
     moved[(problem.observations[..., 2] == 0) | ~np.isfinite(moved).all(-1)] = 0

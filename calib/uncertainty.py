@@ -24,10 +24,15 @@ from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.mrcal_versions import Layout, Problem
 from rainstereo.calib.rotation import cross_matrix, rotated_by
 from rainstereo.calib.solve import Solution
-from rainstereo.calib.state_covariance import Covariance as Covariance
-from rainstereo.calib.state_covariance import regular_inverse as regular_inverse
+from rainstereo.calib.state_covariance import Covariance, regular_inverse
 from rainstereo.rig import ROLES, Rig, Role
 from rainstereo.types import Array, Mask
+
+__all__ = [
+    "GRID", "Covariance", "Difference", "Gauge", "InfinityError", "UncertaintyMap", "baseline_sigma", "covariance",
+    "image_grid", "infinity_error", "infinity_uncertainty", "problem_of", "regular_inverse",
+    "stereo_infinity_uncertainty",
+]  # fmt: skip
 
 GRID = (24, 18)
 MARGIN = 0.02

@@ -220,7 +220,9 @@ class Chamber:
         ]
         sd = self.uncertainty
         if self.nominal:
-            lines.append(f"nominal = {list(self.nominal)!r}   # taken from a description, not measured".replace("'", '"'))
+            lines.append(
+                f"nominal = {list(self.nominal)!r}   # taken from a description, not measured".replace("'", '"')
+            )
         if sd is not None:
             lines.append(f"tilt_sd_deg = {math.degrees(sd.tilt)!r}   # standard deviation, as all that ends in _sd")
         for i, panel in enumerate(self.panels):

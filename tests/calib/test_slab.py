@@ -73,7 +73,7 @@ def test_derivatives_match_differences(pitch_deg: float, wedge: tuple[float, flo
 def test_a_wedge_turns_rays_as_snell_has_it_at_two_faces(
     slope: tuple[float, float], wedge: tuple[float, float], pitch_deg: float
 ) -> None:
-    """A point on the traced ray seems to lie in the direction in which the ray set out, to second order in the wedge."""
+    """A point on the traced ray seems to lie where the ray set out to, to second order in the wedge."""
     inside = chamber(pitch_deg, panels=(Panel(0.004, 1.49),), gaps=())
     n = np.array(inside.normal)
     W = slabs.across(n) @ wedge
