@@ -45,6 +45,8 @@ class Options:
     """Poses of each board behind the chamber."""
     bare_frames: int = 20
     """Poses of each board without the chamber; 0: no such capture."""
+    still: bool = False
+    """Rig and board stand still while the chamber is put in: the capture without it shows the same poses."""
     near_m: float | None = None
     """Nearest board, metres; by default 0.3, or where a larger board fills the frame."""
     far_m: float | None = None
@@ -161,7 +163,7 @@ def _captures(options: Options, rig: Rig, name: str, board: Board, seed: tuple[i
     for through, frames in ((False, options.bare_frames), (True, options.frames)):
         if frames:
             poses = board_poses(
-                rig, board, frames, (*seed, int(through)), through=through,
+                rig, board, frames, (*seed, int(through or options.still)), through=through or options.still,
                 near=options.near_m, far=options.far_m, tilt_deg=options.board_tilt_deg,
             )  # fmt: skip
             captures.append(Capture(name, board, through, poses))

@@ -201,7 +201,11 @@ class Linearization:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things stand in the state vector; an empty slice for what is not optimised."""
+    """Where things stand in the state vector; an empty slice for what is not optimised.
+
+    slab: the parameters of the panels (`slab.Slab.names` in this order), which follow mrcal's state; mrcal's own
+    functions know nothing of them. size counts them.
+    """
 
     size: int
     intrinsics: tuple[slice, ...]
@@ -209,6 +213,12 @@ class Layout:
     extrinsics: slice
     frames: slice
     warp: slice
+    slab: slice = field(default_factory=lambda: slice(0, 0))
+
+    def with_slab(self, count: int) -> Layout:
+        """The same with `count` parameters of the panels behind mrcal's state, in place of those there were."""
+        size = self.size - (self.slab.stop - self.slab.start)
+        return replace(self, size=size + count, slab=slice(size, size + count) if count else slice(0, 0))
 
 
 def optimize(problem: Problem, *, outliers: bool = False) -> None:
