@@ -23,6 +23,7 @@ STAGES: dict[str, str] = {
     "refraction": "rainstereo.apps.bench_refraction",
     "warp": "rainstereo.apps.bench_warp",
     "calibration": "rainstereo.apps.bench_calibration",
+    "slab": "rainstereo.apps.bench_slab",
     "drops": "rainstereo.apps.bench_drops",
     "rain": "rainstereo.apps.bench_rain",
     "align": "rainstereo.apps.bench_align",
@@ -43,7 +44,8 @@ class Options:
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What to measure: refraction, warp, calibration, drops, rain, align, record, select, train, derain, or all."""
+    """What to measure: refraction, warp, calibration, slab, drops, rain, align, record, select, train, derain, or
+    all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15
