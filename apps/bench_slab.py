@@ -37,8 +37,8 @@ def build(seed: int, quick: bool) -> Stage:
             "rig": "two OPENCV8 cameras of 1280x960, f about 1200 px, 29 mm apart, behind two 4 mm panels",
             "board": BOARD.spec,
             "noise": f"{NOISE_PX} px a coordinate",
-            "description": f"standard deviations {1e3 * SD.thickness[0]:g} mm a panel, {np.degrees(SD.tilt):g} degrees, "
-            f"index {SD.index[0]:g}",
+            "description": f"standard deviations {1e3 * SD.thickness[0]:g} mm a panel, {np.degrees(SD.tilt):g} "
+            f"degrees, index {SD.index[0]:g}",
             "runs": runs,
             "seed": seed,
         },
