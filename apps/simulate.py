@@ -40,7 +40,8 @@ class Options:
     out: Path
     """Folder to write; made if missing."""
     boards: tuple[str, ...] = ("chessboard:9x6:25mm", "charuco:11x8:25mm:19mm:DICT_4X4_250")
-    """Boards to capture: chessboard:WxH:SQUARE (inner corners) or charuco:WxH:SQUARE:MARKER:DICTIONARY (squares)."""
+    """Boards to capture: chessboard:WxH:SQUARE (inner corners), charuco:WxH:SQUARE:MARKER:DICTIONARY (squares), or a
+    description as rainstereo board writes it, FILE.toml."""
     frames: int = 20
     """Poses of each board behind the chamber."""
     bare_frames: int = 20

@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -100,7 +101,13 @@ class Board:
 
         A chessboard's WxH counts inner corners, a ChArUco board's counts squares (as OpenCV does). Lengths carry a
         unit: mm, cm or m. If the square's size is unknown, say ``1m``: every length is then in squares.
+
+        A name that ends in ``.toml`` is a file with a board's description, as `rainstereo board` writes it.
         """
+        if spec.strip().lower().endswith(".toml"):
+            from rainstereo.calib import board_file
+
+            return board_file.read(Path(spec.strip()))
         kind, *fields = (field.strip() for field in spec.split(":"))
         expected = {"chessboard": 2, "charuco": 4}
         if kind.lower() not in expected:
@@ -120,10 +127,10 @@ class Board:
     def spec(self) -> str:
         """The board in words; ``Board.parse(board.spec) == board``."""
         width, height = self.squares if self.kind == "charuco" else (self.columns, self.rows)
-        words = f"{self.kind}:{width}x{height}:{_words(self.square)}"
+        words = f"{self.kind}:{width}x{height}:{words_of_length(self.square)}"
         if self.marker is None:
             return words
-        return f"{words}:{_words(self.marker)}:{self.dictionary}"
+        return f"{words}:{words_of_length(self.marker)}:{self.dictionary}"
 
     @property
     def squares(self) -> tuple[int, int]:
@@ -134,6 +141,11 @@ class Board:
     def size(self) -> tuple[float, float]:
         """Extent of all squares along x and y, in metres."""
         return self.square * (self.columns + 1), self.square * (self.rows + 1)
+
+    @property
+    def margin(self) -> float:
+        """Extent of the print to the left of corner [0, 0] and above it, in metres."""
+        return self.square
 
     @cached_property
     def points(self) -> Array:
@@ -239,7 +251,7 @@ def _length(text: str, spec: str) -> float:
     return float(match["value"]) / round(1 / _METRES[match["unit"]])
 
 
-def _words(metres: float) -> str:
+def words_of_length(metres: float) -> str:
     """Shortest decimal in mm that reads back as exactly this float64 (in m where whole, or where there is none)."""
     if metres == int(metres):
         return f"{int(metres)}m"
