@@ -89,9 +89,9 @@ def _too_large(board: Board, paper: str, sizes: tuple[tuple[float, float], ...])
                                               for a, b in ((w, h), (h, w))) >= 1]  # fmt: skip
     remedy = f"; or take {larger[0]}" if larger else ""
     return (
-        f"the squares of {board.spec} span {across:g} x {down:g} mm, which does not fit on {paper} with {MARGIN:g} mm of "
-        f"white on each side and {STRIP:g} mm for the scale bar. The largest that fits has squares of {largest:g} mm: "
-        f"{fitting.spec}{remedy}"
+        f"the squares of {board.spec} span {across:g} x {down:g} mm, which does not fit on {paper} with {MARGIN:g} mm "
+        f"of white on each side and {STRIP:g} mm for the scale bar. The largest that fits has squares of {largest:g} "
+        f"mm: {fitting.spec}{remedy}"
     )
 
 
@@ -126,8 +126,8 @@ def svg(page: Sheet, title: str) -> bytes:
     """The sheet as SVG whose user unit is the millimetre."""
     width, height = (_number(n) for n in page.size)
     words = "\n".join(
-        f'<text x="{_number(x)}" y="{_number(y)}" font-size="{_number(tall)}" font-family="Helvetica, Arial, sans-serif"'
-        f' xml:space="preserve">{escape(text)}</text>'
+        f'<text x="{_number(x)}" y="{_number(y)}" font-size="{_number(tall)}" '
+        f'font-family="Helvetica, Arial, sans-serif" xml:space="preserve">{escape(text)}</text>'
         for x, y, tall, text in page.texts
     )
     return f"""\

@@ -15,7 +15,7 @@ from rainstereo import Chamber
 from rainstereo.apps.calibration_page import Findings, page
 from rainstereo.apps.cli import DONE, FAILED
 from rainstereo.apps.run_record import Record
-from rainstereo.calib import checks, mrcal_versions, uncertainty
+from rainstereo.calib import board_shape, checks, mrcal_versions, uncertainty
 from rainstereo.calib.board import Board
 from rainstereo.calib.cross_validation import choose_lensmodel
 from rainstereo.calib.mrcal_versions import SolveError
@@ -80,12 +80,13 @@ def run(options: Options) -> int:
         verdict = checks.judge_failure(observations, error, FALLBACK)
         return _finish(options, record, Findings(observations, None, None, choice, verdict, None), clock)
     covariance = uncertainty.covariance(solution)
-    expected = options.expected_baseline_mm
+    expected, shape = options.expected_baseline_mm, board_shape.examine(solution)
     verdict = checks.judge(
-        observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance
+        observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance, shape=shape
     )
     clock("uncertainty and checks")
-    return _finish(options, record, Findings(observations, solution, covariance, choice, verdict, chamber), clock)
+    found = Findings(observations, solution, covariance, choice, verdict, chamber, shape)
+    return _finish(options, record, found, clock)
 
 
 class Clock:
@@ -184,6 +185,7 @@ def results(findings: Findings, clock: Clock) -> dict[str, object]:
         "dropped": solution.dropped,
         "reordered": solution.reordered,
         "board_warp_m": solution.calobject_warp,
+        "board_shape": findings.shape,
         "refraction": solution.passes,
         "solve_seconds": solution.solve_seconds,
     }

@@ -12,6 +12,7 @@ from rainstereo.apps import figures
 from rainstereo.apps.report import Mood, Report, Tile, quantity
 from rainstereo.apps.run_record import Record
 from rainstereo.calib import uncertainty
+from rainstereo.calib.board_shape import BoardShape
 from rainstereo.calib.checks import Verdict
 from rainstereo.calib.cross_validation import Choice
 from rainstereo.calib.observations import Observations
@@ -35,6 +36,7 @@ class Findings:
     choice: Choice | None
     verdict: Verdict
     chamber: Chamber | None
+    shape: BoardShape | None = None
 
     @cached_property
     def infinity(self) -> dict[str, UncertaintyMap]:
@@ -60,7 +62,7 @@ def page(findings: Findings, record: Record) -> Report:
         _reach(report, solution, findings)
         _scene(report, solution)
         _frames(report, solution)
-        _cameras(report, solution)
+        _cameras(report, solution, findings.shape)
     if findings.choice is not None:
         _models(report, findings.choice)
     if findings.observations.rejected:
@@ -171,7 +173,7 @@ def _frames(report: Report, solution: Solution) -> None:
         report.table(("frame", "why it was not used"), [(drop.name, drop.reason) for drop in solution.dropped])
 
 
-def _cameras(report: Report, solution: Solution) -> None:
+def _cameras(report: Report, solution: Solution, shape: BoardShape | None) -> None:
     rig = solution.rig
     rt = rig.rt_wet_dry
     centre = invert(rt)[3:] * 1000
@@ -187,8 +189,14 @@ def _cameras(report: Report, solution: Solution) -> None:
     report.text(
         f"The wet camera stands {abs(centre[0]):.2f} mm to the {side} of the dry one, {centre[1]:+.2f} mm down and "
         f"{centre[2]:+.2f} mm ahead, turned by {turn:.3f} degrees. The board is bent by "
-        f"{bent[0]:.2f} mm along its columns and {bent[1]:.2f} mm along its rows."
+        f"{bent[0]:.2f} mm along its columns and {bent[1]:.2f} mm along its rows{_twist(shape)}."
     )
+
+
+def _twist(shape: BoardShape | None) -> str:
+    if shape is None:
+        return ""
+    return f" and twisted by {1000 * shape.twist:.3f} +- {1000 * shape.twist_sigma:.3f} mm, which is not modelled"
 
 
 def _models(report: Report, choice: Choice) -> None:

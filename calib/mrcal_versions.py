@@ -148,6 +148,11 @@ class Problem:
         own["warp"] = None if self.warp is None else np.array(self.warp)
         return replace(self, **{**own, **changes})
 
+    def board(self, warp: Array | None = None) -> Array:
+        """Corners of the board in its own frame, (rows, columns, 3) metres, flat unless a warp is given."""
+        rows, columns = self.observations.shape[1:3]
+        return board_points(rows, columns, self.spacing, warp)
+
     def arguments(self, legacy: bool | None = None) -> dict[str, Any]:
         """Keyword arguments for mrcal's functions, in its names; arrays are ours, so that mrcal changes them.
 
