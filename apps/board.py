@@ -26,8 +26,9 @@ class Options:
     """
 
     spec: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="BOARD")]
-    """chessboard:9x6:25mm (inner corners, side of a square) or charuco:11x8:25mm:19mm:DICT_4X4_250 (squares, their
-    side, side of a marker, dictionary); or a description, FILE.toml."""
+    """chessboard:9x6:25mm (inner corners, side of a square), charuco:11x8:25mm:19mm:DICT_4X4_250 (squares, their side,
+    side of a marker, dictionary), aprilgrid:6x6:88mm:0.3 (tags, side of a tag, gap in sides of a tag); or a
+    description, FILE.toml."""
     out: Path
     """Drawing to write: FILE.pdf or FILE.svg; beside it FILE.toml and FILE.report.json."""
     paper: str = "A4"

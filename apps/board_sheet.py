@@ -87,10 +87,11 @@ def _too_large(board: Board, paper: str, sizes: tuple[tuple[float, float], ...])
     larger = [name for name, (w, h) in sorted(PAPERS.items(), key=lambda item: item[1])
               if name.startswith("A") and max(min((a - 2 * MARGIN) / across, (b - 2 * MARGIN - STRIP) / down)
                                               for a, b in ((w, h), (h, w))) >= 1]  # fmt: skip
+    what = "tags" if board.kind == "aprilgrid" else "squares"
     remedy = f"; or take {larger[0]}" if larger else ""
     return (
-        f"the squares of {board.spec} span {across:g} x {down:g} mm, which does not fit on {paper} with {MARGIN:g} mm "
-        f"of white on each side and {STRIP:g} mm for the scale bar. The largest that fits has squares of {largest:g} "
+        f"the pattern of {board.spec} spans {across:g} x {down:g} mm, which does not fit on {paper} with {MARGIN:g} mm "
+        f"of white on each side and {STRIP:g} mm for the scale bar. The largest that fits has {what} of {largest:g} "
         f"mm: {fitting.spec}{remedy}"
     )
 

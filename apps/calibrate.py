@@ -38,8 +38,9 @@ class Options:
     """Board images of the wet camera; files are paired by name (left01 with right01, 0007 with 0007)."""
     board: str
     """What is printed on the board: chessboard:9x6:25mm (inner corners, side of a square), or
-    charuco:31x16:49.33mm:38.46mm:DICT_4X4_1000 (squares, their side, side of a marker, dictionary); or the
-    description that rainstereo board writes, FILE.toml."""
+    charuco:31x16:49.33mm:38.46mm:DICT_4X4_1000 (squares, their side, side of a marker, dictionary), or
+    aprilgrid:6x6:88mm:0.3 (tags, side of a tag, gap in sides of a tag: Kalibr's); or the description that
+    rainstereo board writes, FILE.toml."""
     out: Path
     """Rig folder to write: dry.cameramodel, wet.cameramodel, chamber.toml, report.html, report.json."""
     chamber: Path | None = None

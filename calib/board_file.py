@@ -12,19 +12,23 @@ from typing import Any
 from rainstereo.calib.board import Board, words_of_length
 
 LARGEST = 1 << 16
-SHAPE = {"chessboard": "inner_corners", "charuco": "squares"}
+SHAPE = {"chessboard": "inner_corners", "charuco": "squares", "aprilgrid": "tags"}
+LENGTHS = {"chessboard": ("square_mm",), "charuco": ("square_mm", "marker_mm"), "aprilgrid": ("tag_mm",)}
+OTHER = {"chessboard": (), "charuco": ("dictionary",), "aprilgrid": ("spacing",)}
 
 
 def description(board: Board) -> str:
     """The text of the file; `read` gives the same board again."""
-    shape = board.squares if board.kind == "charuco" else (board.columns, board.rows)
+    shape = board.shape
     lines = [
         f"# {board.spec}",
-        "# Measure the print over as many squares as possible and correct the lengths here.",
+        "# Measure the print over as long a way as possible and correct the lengths here.",
         f'kind = "{board.kind}"',
         f"{SHAPE[board.kind]} = [{shape[0]}, {shape[1]}]",
-        f"square_mm = {_millimetres(board.square)}",
+        f"{LENGTHS[board.kind][0]} = {_millimetres(board.square)}",
     ]
+    if board.spacing is not None:
+        lines.append(f"spacing = {board.spacing!r}  # gap in sides of a tag")
     if board.marker is not None:
         lines += [f"marker_mm = {_millimetres(board.marker)}", f'dictionary = "{board.dictionary}"']
     return "\n".join(lines) + "\n"
@@ -41,7 +45,7 @@ def read(path: Path) -> Board:
     kind = table.pop("kind", None)
     if not isinstance(kind, str) or kind not in SHAPE:
         raise ValueError(f"{path}: kind is {kind!r}; expected one of {', '.join(SHAPE)}")
-    needed = {SHAPE[kind], "square_mm"} | ({"marker_mm", "dictionary"} if kind == "charuco" else set())
+    needed = {SHAPE[kind], *LENGTHS[kind], *OTHER[kind]}
     missing, unknown = needed - set(table), set(table) - needed
     if missing or unknown:
         told = [f"lacks {', '.join(sorted(missing))}"] * bool(missing)
@@ -50,8 +54,10 @@ def read(path: Path) -> Board:
     shape = table[SHAPE[kind]]
     if not (isinstance(shape, list) and len(shape) == 2 and all(type(n) is int for n in shape)):
         raise ValueError(f"{path}: {SHAPE[kind]} is {shape!r}; expected two whole numbers such as [9, 6]")
-    square = _metres(path, table, "square_mm")
+    square = _metres(path, table, LENGTHS[kind][0])
     try:
+        if kind == "aprilgrid":
+            return Board("aprilgrid", 2 * shape[0], 2 * shape[1], square, spacing=_number(path, table, "spacing"))
         if kind == "chessboard":
             return Board("chessboard", shape[0], shape[1], square)
         marker = _metres(path, table, "marker_mm")
@@ -66,7 +72,12 @@ def _millimetres(metres: float) -> str:
 
 
 def _metres(path: Path, table: dict[str, Any], key: str) -> float:
+    return _number(path, table, key) / 1000
+
+
+def _number(path: Path, table: dict[str, Any], key: str) -> float:
     value = table[key]
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{path}: {key} is {value!r}; expected a number of millimetres, such as 25.0")
-    return float(value) / 1000
+        unit = " of millimetres, such as 25.0" if key.endswith("_mm") else ", such as 0.3"
+        raise ValueError(f"{path}: {key} is {value!r}; expected a number{unit}")
+    return float(value)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from rainstereo.calib.board import Board
+from rainstereo.calib.board import TAG_BORDER, TAGS, Board, aruco_dictionary
 from rainstereo.types import Array, Mask
 
 
@@ -14,7 +15,50 @@ def black_rectangles(board: Board) -> Array:
 
     Rectangles may touch and never overlap.
     """
+    if board.kind == "aprilgrid":
+        return _aprilgrid(board)
     return _squares(board) if board.kind == "chessboard" else np.concatenate([_squares(board), _markers(board)])
+
+
+def _aprilgrid(board: Board) -> Array:
+    """Tags as AprilTag draws them, and the squares in the gaps that make each tag's corner a chessboard's."""
+    (width, height), dictionary = board.shape, aruco_dictionary(TAGS)
+    modules = int(dictionary.markerSize) + 2 * TAG_BORDER
+    gap = board.margin
+    found = []
+    for row in range(height):
+        for column in range(width):
+            identity = width * (height - 1 - row) + column
+            turned = cv2.aruco.generateImageMarker(dictionary, identity, modules, borderBits=TAG_BORDER) == 0
+            corner = board.points[2 * row, 2 * column, :2]
+            found.append(placed(np.rot90(turned, 2), corner, board.square / modules))
+    pitch = board.square + gap
+    row, column = np.divmod(np.arange((width + 1) * (height + 1)), width + 1)
+    side = np.full(len(row), gap)
+    return np.concatenate([*found, np.column_stack([column * pitch - gap, row * pitch - gap, side, side])])
+
+
+def picture(board: Board, pixels_per_square: int, edge: int, largest: int) -> tuple[npt.NDArray[np.uint8], Array]:
+    """`Board.texture` from the rectangles: every texel has its exact share of black. edge: white border in texels."""
+    inside = np.ceil(np.array(board.size) / board.square * pixels_per_square - 1e-9).astype(int)
+    width, height = (int(n) for n in inside + 2 * edge)
+    if width * height > largest:
+        raise ValueError(f"{pixels_per_square} texels a tag make a picture above {largest} texels; give fewer")
+    scaled = black_rectangles(board) / board.square * pixels_per_square
+    origin = edge + board.margin / board.square * pixels_per_square
+    ink = np.zeros((height, width), dtype=np.float32)
+    for x, y, w, h in scaled:
+        left, across = _shares(origin + x, w)
+        top, down = _shares(origin + y, h)
+        ink[top : top + len(down), left : left + len(across)] += np.outer(down, across)
+    return np.round(255 * (1 - np.minimum(ink, 1))).astype(np.uint8), np.full(2, origin - 0.5)
+
+
+def _shares(start: float, length: float) -> tuple[int, Array]:
+    """The first texel that an interval touches, and the share of each texel that it covers."""
+    first = int(np.floor(start + 1e-9))
+    texel = np.arange(first, int(np.ceil(start + length - 1e-9)))
+    return first, np.clip(np.minimum(texel + 1, start + length) - np.maximum(texel, start), 0, 1)
 
 
 def _squares(board: Board) -> Array:
