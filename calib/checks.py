@@ -319,5 +319,4 @@ def geometry(solution: Solution, expected_baseline: float | None) -> list[Findin
 
 
 def _board_extent(solution: Solution) -> float:
-    rows, columns = solution.problem.observations.shape[1:3]
-    return solution.problem.spacing * (rows + columns - 2) / 2
+    return float(solution.problem.board()[-1, -1, :2].sum()) / 2

@@ -164,8 +164,7 @@ def _in_reference(problem: Problem, frames: Array) -> Array:
 
 
 def _board(problem: Problem, warp: Array | None) -> Array:
-    rows, columns = problem.observations.shape[1:3]
-    return versions.board_points(rows, columns, problem.spacing, warp)
+    return problem.board(warp)
 
 
 def _range(span: slice) -> Array:
