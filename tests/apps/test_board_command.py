@@ -13,7 +13,7 @@ from rainstereo.apps.cli import main
 from rainstereo.calib import board_file, corners
 from rainstereo.calib.board import Board
 
-SPECS = ["chessboard:9x6:25mm", "charuco:8x5:30mm:22mm:DICT_4X4_50"]
+SPECS = ["chessboard:9x6:25mm", "charuco:8x5:30mm:22mm:DICT_4X4_50", "aprilgrid:5x3:38mm:0.3"]
 PATH = re.compile(r"M(-?[\d.]+) (-?[\d.]+)h([\d.]+)v([\d.]+)h-[\d.]+z")
 
 
@@ -72,14 +72,13 @@ def test_the_drawing_is_found_where_it_should_be_and_to_scale(spec: str, tmp_pat
     assert size is not None
     assert size.groups() == ("297", "210", "297", "210")
     black = svg_rectangles(text, "board")
-    pitch = 1000 * board.square
-    assert black[:, :2].min(0) == pytest.approx(
-        [(297 - pitch * board.squares[0]) / 2, (202 - pitch * board.squares[1]) / 2], abs=1e-5
-    )
+    spans = {"chessboard": (250, 175), "charuco": (240, 150), "aprilgrid": (258.4, 159.6)}[board.kind]
+    assert black[:, :2].min(0) == pytest.approx([(297 - spans[0]) / 2, (202 - spans[1]) / 2], abs=1e-5)
+    first = {"chessboard": 25, "charuco": 30, "aprilgrid": 0.3 * 38}[board.kind]
     image = rasterised(np.vstack([black, svg_rectangles(text, "scale-bar")]), (297, 210), per_mm)
     found = corners.detect(image, board)
     assert found
-    expected = (black[:, :2].min(0) + pitch + 1000 * board.points[..., :2]) * per_mm - 0.5
+    expected = (black[:, :2].min(0) + first + 1000 * board.points[..., :2]) * per_mm - 0.5
     assert np.abs(found.xy - expected).max() < 0.1
     report = json.loads((tmp_path / "sub" / "b.report.json").read_text())
     assert report["command"] == "board"
