@@ -33,9 +33,9 @@ def _aprilgrid(board: Board) -> Array:
             corner = board.points[2 * row, 2 * column, :2]
             found.append(placed(np.rot90(turned, 2), corner, board.square / modules))
     pitch = board.square + gap
-    row, column = np.divmod(np.arange((width + 1) * (height + 1)), width + 1)
-    side = np.full(len(row), gap)
-    return np.concatenate([*found, np.column_stack([column * pitch - gap, row * pitch - gap, side, side])])
+    down, across = np.divmod(np.arange((width + 1) * (height + 1)), width + 1)
+    side = np.full(len(down), gap)
+    return np.concatenate([*found, np.column_stack([across * pitch - gap, down * pitch - gap, side, side])])
 
 
 def picture(board: Board, pixels_per_square: int, edge: int, largest: int) -> tuple[npt.NDArray[np.uint8], Array]:

@@ -150,7 +150,7 @@ def _through(problem: Problem, seen: Array, chamber: Chamber) -> _Linear:
         lifted = np.einsum("vns,vs->vn", J, lift[where]).reshape(1, -1, *problem.observations.shape[1:3], 2)
         G = (lifted * heights).reshape(len(SHAPES), *J.shape[:2])
         for k, g in enumerate(G):
-            np.add.at(projected[k], where, np.einsum("vns,vn->vs", J, g))
+            np.add.at(projected[k], where.astype(np.intp), np.einsum("vns,vn->vs", J, g))
         columns.append(G.reshape(len(SHAPES), -1).T)
         off.append(away[mine].ravel())
     return _Linear(
@@ -173,8 +173,9 @@ def _moved(problem: Problem, packed: Array, step: Array) -> Difference:
 
 
 def _rig(problem: Problem) -> Rig:
+    places = np.zeros(6), problem.rt_cam_ref[0]
     dry, wet = (
-        Camera(problem.lensmodel, problem.intrinsics[i], *map(int, problem.sizes[i]), rt)
-        for i, rt in enumerate((np.zeros(6), problem.rt_cam_ref[0]))
+        Camera(problem.lensmodel, problem.intrinsics[i], int(problem.sizes[i, 0]), int(problem.sizes[i, 1]), places[i])
+        for i in range(2)
     )
     return Rig(dry, wet)
