@@ -23,6 +23,8 @@ STAGES: dict[str, str] = {
     "refraction": "rainstereo.apps.bench_refraction",
     "warp": "rainstereo.apps.bench_warp",
     "calibration": "rainstereo.apps.bench_calibration",
+    "cavity": "rainstereo.apps.bench_cavity",
+    "guidance": "rainstereo.apps.bench_guidance",
     "drops": "rainstereo.apps.bench_drops",
     "rain": "rainstereo.apps.bench_rain",
     "align": "rainstereo.apps.bench_align",
@@ -43,7 +45,8 @@ class Options:
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What to measure: refraction, warp, calibration, drops, rain, align, record, select, train, derain, or all."""
+    """What: refraction, warp, calibration, cavity, guidance, drops, rain, align, record, select, train, derain, or
+    all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15
@@ -52,16 +55,24 @@ class Options:
     """Seed of everything that is drawn at random."""
     quick: bool = False
     """Little work and at most 3 rounds: does it run, rather than how fast."""
+    cavity: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Images for stage cavity: OpenPTV's set, cam1.png to cam4.png with its .ori files. `all` skips it without."""
+    images: Path | None = None
+    """Photographs, of which none taught the weights, for the stage derain; one of scikit-image's without it."""
     docs: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write STAGE.md and its pictures into this folder, as in docs/benchmarks."""
 
 
 def run(options: Options) -> int:
     """Run the stages that are asked for. Returns 0, whether or not targets are met: figures are no failure."""
-    names = list(STAGES) if options.stage == "all" else [options.stage]
+    names = [options.stage]
+    if options.stage == "all":
+        names = [name for name in STAGES if name != "cavity" or options.cavity is not None]
     for name in names:
         if name not in STAGES:
             raise ValueError(f"there is no stage {name!r}; expected one of {', '.join(STAGES)}, or all")
+    if options.images is not None and "derain" not in names:
+        raise ValueError(f"--images is for the stage derain; {options.stage} measures without any")
     if options.repeats < 1:
         raise ValueError(f"--repeats is {options.repeats}; expected 1 or more")
     if any(os.environ.get(name) != value for name, value in SINGLE_THREAD.items()):
@@ -82,6 +93,8 @@ def command(options: Options, stage: str) -> str:
 def _arguments(options: Options, stage: str) -> list[str]:
     words = ["bench", stage, "--repeats", str(options.repeats), "--seed", str(options.seed)]
     words += ["--quick"] if options.quick else []
+    words += ["--cavity", str(options.cavity)] if options.cavity is not None else []
+    words += ["--images", str(options.images)] if options.images else []
     words += ["--out", str(options.out)]
     return words if options.docs is None else [*words, "--docs", str(options.docs)]
 
@@ -95,7 +108,9 @@ def _run_on_one_thread(options: Options) -> int:
 def _run_stage(name: str, options: Options) -> dict[str, object]:
     record = Record("bench", options)
     before = machine()
-    stage: Stage = importlib.import_module(STAGES[name]).build(options.seed, options.quick)
+    build = importlib.import_module(STAGES[name]).build
+    given = {"cavity": options.cavity, "derain": options.images}.get(name)
+    stage: Stage = build(options.seed, options.quick, *([] if given is None else [given]))
     outcomes = _measure_all(stage, min(options.repeats, 3) if options.quick else options.repeats)
     for key, value in bench_page.figures(stage, outcomes, before).items():
         record[key] = value

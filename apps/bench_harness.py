@@ -92,6 +92,15 @@ class Work:
 
 
 @dataclass(frozen=True)
+class Picture:
+    """A picture that says more than error against time: name of its file, caption, and what draws it, a Figure."""
+
+    name: str
+    caption: str
+    draw: Callable[[], Any]
+
+
+@dataclass(frozen=True)
 class Stage:
     """A page of the benchmark: its works, what they are made from, and what the reader must know."""
 
@@ -101,6 +110,7 @@ class Stage:
     works: tuple[Work, ...]
     setting: Mapping[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    pictures: tuple[Picture, ...] = ()
 
 
 @dataclass(frozen=True)

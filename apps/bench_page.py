@@ -163,6 +163,8 @@ def page(stage: Stage, outcomes: tuple[Outcome, ...], machine: Mapping[str, obje
         table: list[tuple[Cell, ...]] = [tuple(row) for row in rows(outcome)]
         columns = header(outcome)
         report.table(columns, table, _rounds_words(outcome), strong, numbers=range(1, len(columns) - 1))
+    for picture in stage.pictures:
+        report.figure(picture.draw(), picture.caption)
     report.section("Where rainstereo wins, and where it loses")
     for heading, sentences in _judgements(outcomes):
         report.text(f"{heading}:")
@@ -194,6 +196,8 @@ def markdown(stage: Stage, outcomes: tuple[Outcome, ...], machine: Mapping[str, 
         lines += [f"| {' | '.join(columns)} |", f"| --- |{' ---: |' * (len(columns) - 2)} --- |"]
         lines += [f"| {' | '.join(_cell(cell) for cell in row)} |" for row in rows(outcome)]
         lines += ["", _rounds_words(outcome), ""]
+    for picture in stage.pictures:
+        lines += [f"![{picture.name}]({stage.name}-{picture.name}.svg)", "", picture.caption, ""]
     for heading, sentences in _judgements(outcomes):
         lines += [f"## {heading}", "", *(f"- {sentence}" for sentence in sentences), ""]
     lines += [
@@ -219,8 +223,10 @@ def picture_name(stage: Stage, outcome: Outcome) -> str:
 
 
 def write_pictures(stage: Stage, outcomes: tuple[Outcome, ...], folder: Path) -> list[Path]:
-    """Write the plot of each work into `folder`."""
-    return [write_atomically(folder / picture_name(stage, o), to_svg(plot(o)).encode()) for o in outcomes]
+    """Write the plot of each work, and the stage's own pictures, into `folder`."""
+    drawn = [(picture_name(stage, o), plot(o)) for o in outcomes]
+    drawn += [(f"{stage.name}-{picture.name}.svg", picture.draw()) for picture in stage.pictures]
+    return [write_atomically(folder / name, to_svg(figure).encode()) for name, figure in drawn]
 
 
 def plain_table(outcome: Outcome) -> str:

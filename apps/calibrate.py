@@ -32,10 +32,6 @@ FALLBACK = "LENSMODEL_OPENCV8"
 class Options:
     """Calibrate a rig from images of a board that both cameras see, through the chamber's panels or without them."""
 
-    dry: str
-    """Board images of the dry camera: a folder, or a quoted glob such as 'boards/left*.png'."""
-    wet: str
-    """Board images of the wet camera; files are paired by name (left01 with right01, 0007 with 0007)."""
     board: str
     """What is printed on the board: chessboard:9x6:25mm (inner corners, side of a square), or
     charuco:31x16:49.33mm:38.46mm:DICT_4X4_1000 (squares, their side, side of a marker, dictionary), or
@@ -43,6 +39,20 @@ class Options:
     rainstereo board writes, FILE.toml."""
     out: Path
     """Rig folder to write: dry.cameramodel, wet.cameramodel, chamber.toml, report.html, report.json."""
+    dry: str = ""
+    """Board images of the dry camera: a folder, or a quoted glob such as 'boards/left*.png'."""
+    wet: str = ""
+    """Board images of the wet camera; files are paired by name (left01 with right01, 0007 with 0007)."""
+    watch: Path | None = None
+    """Instead of --dry and --wet: a folder that a capture is writing to, with dry/ and wet/ in it or images named
+    left* and right* (dry* and wet*). The calibration keeps up, shows on a page where to hold the board next, and ends
+    when the target is met; Ctrl-C ends it earlier. Either way the rig is written."""
+    target: str = "0.1px"
+    """With --watch: how well the least certain direction at infinity is to be known, one standard deviation."""
+    keep_going: bool = False
+    """With --watch: go on when the target is met, until Ctrl-C."""
+    port: int = 8417
+    """With --watch: port of the page on this machine (127.0.0.1); 0 for any that is free."""
     chamber: Path | None = None
     """The panels that both cameras look through, as a chamber.toml; without it they are taken to look through air."""
     lensmodel: str = "auto"
@@ -59,6 +69,12 @@ class Options:
 
 def run(options: Options) -> int:
     """Calibrate; the exit status."""
+    if options.watch is not None:
+        from rainstereo.apps import watch
+
+        return watch.run(options)
+    if not (options.dry and options.wet):
+        raise ValueError("give the board images of both cameras: --dry DIR --wet DIR, or --watch DIR while capturing")
     record = Record("calibrate", options)
     board = Board.parse(options.board)
     chamber = None if options.chamber is None else Chamber.load(options.chamber)
@@ -70,6 +86,11 @@ def run(options: Options) -> int:
         )
     clock("detection")
     print(f"{len(observations)} pairs show the board ({len(observations.rejected)} files left out)")
+    return finish(options, record, examine(options, observations, chamber, clock), clock)
+
+
+def examine(options: Options, observations: Observations, chamber: Chamber | None, clock: Clock) -> Findings:
+    """Choose a lens model where none is given, solve, and judge the result."""
     choice = None
     try:
         if options.lensmodel == "auto":
@@ -79,15 +100,14 @@ def run(options: Options) -> int:
         clock("solve")
     except SolveError as error:
         verdict = checks.judge_failure(observations, error, FALLBACK)
-        return _finish(options, record, Findings(observations, None, None, choice, verdict, None), clock)
+        return Findings(observations, None, None, choice, verdict, None)
     covariance = uncertainty.covariance(solution)
     expected, shape = options.expected_baseline_mm, board_shape.examine(solution)
     verdict = checks.judge(
         observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance, shape=shape
     )
     clock("uncertainty and checks")
-    found = Findings(observations, solution, covariance, choice, verdict, chamber, shape)
-    return _finish(options, record, found, clock)
+    return Findings(observations, solution, covariance, choice, verdict, chamber, shape)
 
 
 class Clock:
@@ -115,7 +135,7 @@ def progress(words: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bars.update(task, completed=done, total=total)
 
 
-def _finish(options: Options, record: Record, findings: Findings, clock: Clock) -> int:
+def finish(options: Options, record: Record, findings: Findings, clock: Clock) -> int:
     """Write the rig if it may be trusted, the record and the page in any case; say in words what came out."""
     verdict, solution = findings.verdict, findings.solution
     refused = solution is None or verdict.status == "refused"

@@ -148,9 +148,9 @@ def _reach(report: Report, solution: Solution, findings: Findings) -> None:
 def _scene(report: Report, solution: Solution) -> None:
     report.section("Boards and cameras", "Boards should stand near and far, tilted each another way.")
     rig = solution.rig
-    rows, columns = solution.residuals["dry"].shape[1:3]
-    spacing = solution.problem.spacing
-    outline = spacing * np.array([[-1, -1, 0], [columns, -1, 0], [columns, rows, 0], [-1, rows, 0]], dtype=np.float64)
+    s = solution.problem.spacing
+    x, y, _ = solution.problem.board()[-1, -1] + s
+    outline = np.array([[-s, -s, 0], [x, -s, 0], [x, y, 0], [-s, y, 0]], dtype=np.float64)
     boards = np.stack([transform(rt, outline) for rt in solution.rt_ref_board])
     frusta: dict[str, Array] = {role: _frustum(rig, role) for role in ROLES}
     panels = None if rig.chamber is None else _panels(rig.chamber)

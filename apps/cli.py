@@ -41,6 +41,9 @@ COMMANDS: dict[str, Command] = {
         "board images to a rig folder, through the acrylic",
         "rainstereo calibrate --dry boards/dry --wet boards/wet --board chessboard:9x6:25mm --out rig",
     ),
+    "convert": Command(
+        "calibrations from and for OpenCV, ROS and Kalibr", "rainstereo convert camchain.yaml --out rig"
+    ),
     "align": Command(
         "a recording to undistorted, cropped, aligned pairs",
         "rainstereo align --dry drive/dry --wet drive/wet --rig rig --out aligned",

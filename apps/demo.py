@@ -76,7 +76,7 @@ def _stages(options: Options) -> dict[str, Callable[[], int]]:
         overwrite=True,
     )
     through = calibrate.Options(
-        str(boards / "dry"), str(boards / "wet"), BOARD, out / "rig", recording / "truth" / "chamber.toml",
+        BOARD, out / "rig", str(boards / "dry"), str(boards / "wet"), chamber=recording / "truth" / "chamber.toml",
         expected_baseline_mm=29.0, cache=out / "corners", pictures=pictures and pictures / "calibrate",
     )  # fmt: skip
     ignoring = replace(through, out=out / "rig-ignoring-acrylic", chamber=None, pictures=None)

@@ -125,14 +125,14 @@ def restorer(options: Options) -> Restorer:
 
 def key_of(options: Options, made: Restorer) -> str:
     """Changes when any byte of the output might, the inputs being the same."""
-    from rainstereo.model import checkpoint, detector
+    from rainstereo.model import checkpoint
+    from rainstereo.model.restore import leaves_out
 
-    files = [options.checkpoint or checkpoint.shipped()]
-    if options.skip:
-        files.append(detector.shipped())
-    weights = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()]
+    path = options.checkpoint or checkpoint.shipped()
+    weights = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
     settings = (
-        options.skip, options.threshold, options.certain, options.halo, options.tile, options.max_megapixels,
+        leaves_out() if options.skip else "",
+        options.threshold, options.certain, options.halo, options.tile, options.max_megapixels,
         options.format, options.video_format, options.lossless, options.detect_every, options.hold, options.reuse,
     )  # fmt: skip
     made_with = [value for name, value in versions().items() if name in ("rainstereo", "torch", "opencv")]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import tyro
 from rich.console import Console
 
@@ -15,9 +17,11 @@ from rainstereo.apps.progress_bar import progress_bar
 from rainstereo.apps.rain_presets import ADHERENT
 from rainstereo.apps.rain_sources import find
 from rainstereo.apps.run_record import Record, versions, write_atomically
+from rainstereo.types import Image
 
 if TYPE_CHECKING:
     from rainstereo.model.augment import RandomAdherentRain
+    from rainstereo.model.detector_training import Rained
 
 MOST_BYTES = 200_000
 
@@ -32,8 +36,12 @@ class Options:
 
     images: tyro.conf.Positional[tuple[str, ...]]
     """Clear images: files, folders or quoted globs; larger than 256 x 192 pixels."""
+    banks: tuple[Path, ...] = ()
+    """Folders that rainstereo rain --masks made of these images, to learn from in place of rain on crops of them."""
     out: Path = Path("detector.safetensors")
     """File to write."""
+    start: Path | None = None
+    """Weights of an earlier run to go on with, in place of random ones."""
     steps: int = 4500
     """Training steps."""
     batch: int = 8
@@ -52,20 +60,23 @@ def run(options: Options) -> int:
     for name, low in (("steps", 10), ("batch", 2), ("pool", 2), ("seed", 0)):
         if getattr(options, name) < low:
             raise ValueError(f"--{name} {getattr(options, name)} was given; expected {low} or more")
-    images = [imagefile.read(source.path) for source in find(options.images) if not source.is_video]
-    images = [image for image in images if image.ndim == 3 and image.dtype == "uint8"]
     from rainstereo.model import detector, detector_training
     from rainstereo.model.card import to_toml
 
+    start = None if options.start is None else detector.load(options.start)
+    named = {source.name: imagefile.read(source.path) for source in find(options.images) if not source.is_video}
+    named = {name: image for name, image in named.items() if image.ndim == 3 and image.dtype == "uint8"}
+    images = list(named.values())
     recipe = detector_training.Recipe(options.steps, options.batch, options.pool, seed=options.seed)
-    console, last = Console(stderr=True), {"rendering": 0, "training": 0}
+    console, last = Console(stderr=True), {"rendering": 0, "reading": 0, "training": 0}
     with progress_bar(console) as told:
 
         def progress(what: str, done: int, total: int) -> None:
             told(what, done - last[what], total)
             last[what] = done
 
-        made = detector_training.train(images, rains(), recipe, told=progress)
+        rain = banked(named, options.banks, options.seed) if options.banks else rains()
+        made = detector_training.train(images, rain, recipe, told=progress, start=start)
     data = detector.packed(made.network)
     if len(data) > MOST_BYTES:
         raise ValueError(f"the weights have {len(data)} bytes; expected {MOST_BYTES} at most")
@@ -73,8 +84,7 @@ def run(options: Options) -> int:
     found = {"loss": made.loss, "cells_found": made.found, "cells_marked_falsely": made.false}
     card = {
         "name": "drop detector", "bytes": len(data), "training_images": len(images), "recipe": asdict(recipe),
-        "rain": "RandomAdherentRain: adherent, drops, large; F/1.4 to F/12; masks of the renderer, opacity above "
-        f"{detector_training.VISIBLE:g}",
+        "rain": f"{_rain(options)}; masks of the renderer, opacity above {detector_training.VISIBLE:g}",
         "held_out": found, "versions": {k: v for k, v in versions().items() if k in ("rainstereo", "torch")},
     }  # fmt: skip
     write_atomically(options.out.with_suffix(".toml"), to_toml(card).encode())
@@ -86,6 +96,37 @@ def run(options: Options) -> int:
         soft_wrap=True,
     )
     return DONE
+
+
+def banked(named: dict[str, Image], banks: Sequence[Path], seed: int) -> Callable[[int], Rained]:
+    """Images under rain, from folders of `rainstereo rain --masks`: each is met once before any is met again."""
+    from rainstereo.model.detector_training import Rained
+
+    found = []
+    for bank in banks:
+        masks = {path.stem: path for path in sorted((bank / "masks").glob("*.png"))}
+        both = [(name, bank / f"{name}.png", masks[name]) for name in sorted(named.keys() & masks.keys())]
+        found += [entry for entry in both if entry[1].is_file()]
+        if not both:
+            raise ValueError(
+                f"{bank} holds no masks of these images; make some with rainstereo rain IMAGES --masks --out {bank}"
+            )
+    order = np.random.default_rng(seed).permutation(len(found))
+
+    def rained(number: int) -> Rained:
+        name, rainy, mask = found[order[number % len(found)]]
+        given = Rained(named[name], imagefile.read(rainy), imagefile.read(mask)[..., 1] / np.float32(255))
+        if given.rainy.shape != given.clear.shape or given.opacity.shape != given.clear.shape[:2]:
+            raise ValueError(f"{rainy} or its mask has not the size of the clear image {name}; render it again")
+        return given
+
+    return rained
+
+
+def _rain(options: Options) -> str:
+    if options.banks:
+        return f"{len(options.banks)} folders of rainstereo rain: {', '.join(bank.name for bank in options.banks)}"
+    return "RandomAdherentRain: adherent, drops, large; F/1.4 to F/12"
 
 
 def rains() -> list[RandomAdherentRain]:

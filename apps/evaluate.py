@@ -66,12 +66,13 @@ def run(options: Options) -> int:
     rain = RenderedRain(options.preset, options.psnr, options.seed)
     rain.renderer()  # says what is wrong with it
     from rainstereo.model.metrics import PROTOCOL
-    from rainstereo.model.restore import Restorer, opened
+    from rainstereo.model.restore import Restorer, leaves_out, opened
 
     made = Restorer(options.checkpoint, options.device, options.precision, skip=options.skip, backend=options.backend)
     name, weights = _weights(options) if options.backend == "onnx" else _identity(opened(options.checkpoint))
     made_with = [v for k, v in versions().items() if k in ("rainstereo", "torch", "opencv")]
-    key = hashlib.sha256(repr((weights, made.network.name, options.skip, rain, made_with)).encode()).hexdigest()[:16]
+    skipped = leaves_out() if options.skip else ""
+    key = hashlib.sha256(repr((weights, made.network.name, skipped, rain, made_with)).encode()).hexdigest()[:16]
     console = Console(stderr=True)
     notes: dict[str, list[Note]] = {}
     with progress_bar(console) as told:

@@ -84,7 +84,7 @@ def run(options: Options) -> int:
     rain = RenderedRain(options.preset, options.psnr, options.seed)
     rain.renderer()  # says what is wrong with it
     from rainstereo.model.networks import pick_device
-    from rainstereo.model.restore import Restorer, opened
+    from rainstereo.model.restore import Restorer, leaves_out, opened
     from rainstereo.model.segmentation_training import Training
 
     training = Training(options.steps, options.batch, options.crop, rate=options.rate, seed=options.seed)
@@ -93,7 +93,7 @@ def run(options: Options) -> int:
     restorer = Restorer(options.checkpoint, options.device, options.precision, skip=options.skip)
     weights = opened(options.checkpoint)
     used = [v for k, v in versions().items() if k in ("rainstereo", "torch", "opencv")]
-    identity = digest(weights.card.get("sha256"), restorer.network.name, options.skip, used)
+    identity = digest(weights.card.get("sha256"), restorer.network.name, leaves_out() if options.skip else "", used)
     console = Console(stderr=True)
     with progress_bar(console) as told:
         results = [

@@ -58,7 +58,7 @@ def error_against_time(
     left = time if low is None else np.asarray(low, float).reshape(-1)
     right = time if high is None else np.asarray(high, float).reshape(-1)
     positive = error[np.isfinite(error) & (error > 0)]
-    bottom = floor if floor is not None else (positive.min() / 10 if positive.size else 1e-16)
+    bottom = floor if floor is not None else (positive.min() / 10 if positive.size else 1e-9)
     marks = [
         Mark(name, time[i], max(error[i], bottom), left[i], right[i], bool(mine[i]), bool(error[i] <= bottom))
         for i, name in enumerate(names)

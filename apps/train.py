@@ -188,8 +188,7 @@ class Watcher:
     def words(self, run: Run) -> str:
         """Losses, speed and time left."""
         losses = "  ".join(f"{name} {value:.4f}" for name, value in self.losses.items() if name != "total")
-        share = run.progress
-        begun = run.begun_at / run.recipe.steps
+        share, begun = run.progress, run.begun_share
         left = self.seconds * (1 - share) / (share - begun) if share > begun else float("nan")
         if run.recipe.minutes:
             left = min(left, 60 * run.recipe.minutes - run.elapsed)

@@ -44,6 +44,43 @@ class Views(NamedTuple):
     files: tuple[tuple[str, str], ...]
 
 
+class Agreed(NamedTuple):
+    """One pair of images after all have agreed on image size and layout: corners (cameras, rows, columns, 2).
+
+    reason: why the pair cannot be used, empty where both cameras see the board.
+    """
+
+    pair: Pair
+    corners: Array
+    reason: str
+
+
+def find(path: Path, board: Board, cache: Path | None) -> Found:
+    """The board in one image file, from the cache if it was searched before."""
+    return _detect_file(path, board, cache)
+
+
+def agree(
+    pairs: Sequence[Pair], found: dict[Path, Found], board: Board
+) -> tuple[dict[str, tuple[int, int]], list[Agreed]]:
+    """Image sizes by role, (0, 0) where no image can be read, and each pair as the others let it stand."""
+    mine = {path: found[path] for pair in pairs for path in (pair.dry, pair.wet)}
+    alike = _one_layout(mine)
+    sizes: dict[str, tuple[int, int]] = {}
+    xy: dict[str, list[Array]] = {}
+    reasons = [""] * len(pairs)
+    for role in ROLES:
+        paths = [pair.path(role) for pair in pairs]
+        sizes[role] = _majority([alike[path].size for path in paths if alike[path].size]) or (0, 0)
+        xy[role], refused = _usable(paths, alike, role, sizes[role])
+        why = {rejection.name: rejection.reason for rejection in refused}
+        for i, path in enumerate(paths):
+            if path.name in why:
+                reasons[i] += f"{'; ' if reasons[i] else ''}{role} image: {why[path.name]}"
+    both = [_order_alike(dry, wet, board) for dry, wet in zip(xy["dry"], xy["wet"], strict=True)]
+    return sizes, [Agreed(pair, np.stack(views), why) for pair, views, why in zip(pairs, both, reasons, strict=True)]
+
+
 def collect(
     pairs: Sequence[Pair],
     unpaired: Sequence[Rejection],

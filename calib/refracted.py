@@ -78,7 +78,7 @@ def normal_equations(problem: Problem, observed: Array, chamber: Chamber) -> Nor
     held, tied = at.residuals[at.boards :], at.jacobian[at.boards :]
     matrix, gradient = (tied.T @ tied).toarray(), tied.T @ held
     total, blocks = float(np.sum(held**2)), []
-    for camera in range(len(problem.intrinsics)):
+    for camera in np.unique(problem.indices[:, 1]):  # a camera may have seen none of the frames
         rows, frames, J, off, columns = _rows(problem, observed, chamber, camera, layout)
         weight = np.maximum(problem.observations[rows][..., 2], 0).reshape(len(frames), -1, 1)
         J = np.where(weight[..., None] > 0, J * weight[..., None] * at.scale[columns][:, None, None], 0)

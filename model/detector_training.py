@@ -17,10 +17,14 @@ from torch.nn import functional
 
 from rainstereo.model.augment import RandomAdherentRain
 from rainstereo.model.detector import OWN, DetectorConfig, DropDetector
-from rainstereo.types import Image
+from rainstereo.types import Array, Image
 
 VISIBLE = 0.15
 """Opacity from which a drop counts: below, the clear scene is what one sees."""
+HURTS = 16.0
+"""Gray levels, on average over a cell, of a drop that counts as much in the loss as a cell without one."""
+WEIGHTS = 0.1, 3.0
+"""Least and most that a cell with a drop counts."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,25 @@ class Recipe:
     rate: float = 2e-3
     clear_share: float = 0.3
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class Rained:
+    """An image, the same under rain, both uint8 BGR, and the opacity of its drops, (H, W) in 0..1."""
+
+    clear: Image
+    rainy: Image
+    opacity: Array
+
+
+@dataclass(frozen=True)
+class Pool:
+    """What is trained on. crops: (N, 3, H, W) uint8 RGB. labels: (N, 1, H / 4, W / 4), a visible drop there.
+    weights: how much each of these counts; drops that one hardly sees count little."""
+
+    crops: Tensor
+    labels: Tensor
+    weights: Tensor
 
 
 @dataclass(frozen=True)
@@ -52,14 +75,17 @@ Told = Callable[[str, int, int], None]
 
 def train(
     images: Sequence[Image],
-    rains: Sequence[RandomAdherentRain],
+    rains: Sequence[RandomAdherentRain] | Callable[[int], Rained],
     recipe: Recipe | None = None,
     config: DetectorConfig | None = None,
     told: Told = lambda what, done, total: None,
+    start: DropDetector | None = None,
 ) -> Trained:
     """Train on clear images, uint8 BGR, all larger than the crops; rains are drawn from evenly.
 
-    told: what is being done, how much of it is done, of how much. The same seed gives the same network on one machine.
+    rains: rain to put on crops of these images; or in its place images under rain, of which any number is asked for.
+    told: what is being done, how much of it is done, of how much. start: a network to go on with; it is changed.
+    The same seed gives the same network on one machine.
     """
     recipe, config = recipe or Recipe(), config or DetectorConfig()
     if not images or not rains:
@@ -67,39 +93,43 @@ def train(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
         draws = np.random.default_rng(recipe.seed)
-        pool, labels = rendered(images, rains, recipe.pool, recipe.size, draws, told)
-        held = max(1, len(pool) // 16)
-        network = config.build().train()
-        losses = _fit(network, pool[held:], labels[held:], images, recipe, draws, told)
+        if callable(rains):
+            pool = cut(rains, recipe.pool, recipe.size, draws, told)
+        else:
+            pool = rendered(images, rains, recipe.pool, recipe.size, draws, told)
+        held = max(1, len(pool.crops) // 16)
+        network = (start or config.build()).train()
+        rest = Pool(pool.crops[held:], pool.labels[held:], pool.weights[held:])
+        losses = _fit(network, rest, images, recipe, draws, told)
     network.eval()
     with torch.inference_mode():
-        seen = network(pool[:held].float() / 255).sigmoid() > 0.5
-    truth = labels[:held]
+        seen = network(pool.crops[:held].float() / 255).sigmoid() > 0.5
+    truth = pool.labels[:held]
     tail = losses[-max(1, len(losses) // 10) :]
     return Trained(network, float(np.mean(tail)), _share(seen, truth), _share(seen, ~truth))
 
 
 def _fit(
-    network: DropDetector, pool: Tensor, labels: Tensor, images: Sequence[Image], recipe: Recipe,
-    draws: np.random.Generator, told: Told,
-) -> list[float]:  # fmt: skip
+    network: DropDetector, pool: Pool, images: Sequence[Image], recipe: Recipe, draws: np.random.Generator, told: Told
+) -> list[float]:
     optimizer = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.rate, recipe.steps)
     clear = round(recipe.clear_share * recipe.batch)
     losses = []
     for step in range(recipe.steps):
-        chosen = torch.from_numpy(draws.integers(len(pool), size=recipe.batch - clear))
-        rainy, truth = pool[chosen].float() / 255, labels[chosen].float()
+        chosen = torch.from_numpy(draws.integers(len(pool.crops), size=recipe.batch - clear))
+        rainy, truth, weight = pool.crops[chosen].float() / 255, pool.labels[chosen].float(), pool.weights[chosen]
         if draws.random() < 0.5:
-            rainy, truth = rainy.flip(-1), truth.flip(-1)
+            rainy, truth, weight = rainy.flip(-1), truth.flip(-1), weight.flip(-1)
         dry = torch.stack([_as_tensor(spoiled(crop(images, recipe.size, draws), draws)) for _ in range(clear)] or [])
         batch = torch.cat([rainy, dry.float() / 255]) if clear else rainy
         truth = torch.cat([truth, torch.zeros(clear, *truth.shape[1:])])
+        weight = torch.cat([weight, torch.ones(clear, *weight.shape[1:])])
         gain = torch.from_numpy(draws.uniform(0.6, 1.4, (len(batch), 1, 1, 1)).astype(np.float32))
         tint = torch.from_numpy(draws.uniform(0.9, 1.1, (len(batch), 3, 1, 1)).astype(np.float32))
         noise = torch.from_numpy((draws.random() * 0.02 * draws.standard_normal(batch.shape)).astype(np.float32))
         logits = network((batch * gain * tint + noise).clamp(0, 1))
-        loss = functional.binary_cross_entropy_with_logits(logits, truth)
+        loss = functional.binary_cross_entropy_with_logits(logits, truth, weight)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -112,23 +142,53 @@ def _fit(
 def rendered(
     images: Sequence[Image], rains: Sequence[RandomAdherentRain], count: int, size: tuple[int, int],
     draws: np.random.Generator, told: Told = lambda what, done, total: None,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Rainy crops, (count, 3, H, W) uint8 RGB, and labels, (count, 1, H / 4, W / 4): a visible drop there."""
-    pool, labels = [], []
+) -> Pool:  # fmt: skip
+    """Crops of clear images on which rain is put."""
+    found = []
     for number in range(count):
         clear = _as_tensor(spoiled(crop(images, size, draws), draws) if number % 4 == 3 else crop(images, size, draws))
         rain = rains[number % len(rains)]
         rainy = rain(clear.float().unsqueeze(0) / 255)
         if rain.layer is None:
             raise RuntimeError("the rain left no layer")
-        pool.append((255 * rainy[0]).round().clamp(0, 255).to(torch.uint8))
-        labels.append(functional.max_pool2d(rain.layer.opacity, OWN, ceil_mode=True)[0] > VISIBLE)
+        found.append(_labelled(clear, (255 * rainy[0]).round().clamp(0, 255).to(torch.uint8), rain.layer.opacity[0]))
         told("rendering", number + 1, count)
-    return torch.stack(pool), torch.stack(labels)
+    return _pooled(found)
+
+
+def cut(
+    rained: Callable[[int], Rained], count: int, size: tuple[int, int], draws: np.random.Generator,
+    told: Told = lambda what, done, total: None,
+) -> Pool:  # fmt: skip
+    """Crops of images that are under rain already."""
+    found = []
+    for number in range(count):
+        given = rained(number)
+        opacity = np.rint(255 * given.opacity).astype(np.uint8)
+        whole = np.dstack([given.clear, given.rainy, opacity])
+        part = crop([whole], size, draws)
+        clear, rainy, drops = part[..., :3], part[..., 3:6], part[..., 6]
+        found.append(_labelled(_as_tensor(clear), _as_tensor(rainy), torch.from_numpy(drops / np.float32(255))[None]))
+        told("reading", number + 1, count)
+    return _pooled(found)
+
+
+def _labelled(clear: Tensor, rainy: Tensor, opacity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """A crop, which of its cells hold a visible drop, and what each of them counts."""
+    label = functional.max_pool2d(opacity[None], OWN, ceil_mode=True)[0] > VISIBLE
+    change = (rainy.float() - clear.float()).abs().mean(0, keepdim=True)
+    hurts = functional.avg_pool2d(change[None], OWN, ceil_mode=True)[0] / HURTS
+    return rainy, label, torch.where(label, hurts.clamp(*WEIGHTS), 1.0)
+
+
+def _pooled(found: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Pool:
+    crops, labels, weights = zip(*found, strict=True)
+    return Pool(torch.stack(crops), torch.stack(labels), torch.stack(weights))
 
 
 def crop(images: Sequence[Image], size: tuple[int, int], draws: np.random.Generator) -> Image:
-    """A part of one of the images, between the crop's own size and the whole, averaged down to that size; mirrored."""
+    """A part of one of the images, between the crop's own size and the whole, averaged down to that size; mirrored.
+    Images may have any number of channels."""
     image = images[int(draws.integers(len(images)))]
     height, width = image.shape[:2]
     most = min(height / size[0], width / size[1])
@@ -139,8 +199,9 @@ def crop(images: Sequence[Image], size: tuple[int, int], draws: np.random.Genera
     top, left = int(draws.integers(height - rows + 1)), int(draws.integers(width - columns + 1))
     part = image[top : top + rows, left : left + columns]
     part = part[:, ::-1] if draws.random() < 0.5 else part
-    found: Image = cv2.resize(np.ascontiguousarray(part), size[::-1], interpolation=cv2.INTER_AREA)
-    return found
+    layers = [part[..., first : first + 3] for first in range(0, part.shape[2], 3)]  # OpenCV takes 4 at most
+    small = [cv2.resize(np.ascontiguousarray(layer), size[::-1], interpolation=cv2.INTER_AREA) for layer in layers]
+    return small[0] if len(small) == 1 else np.dstack(small)
 
 
 def spoiled(image: Image, draws: np.random.Generator) -> Image:

@@ -185,22 +185,42 @@ class Generator(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """The derained images."""
-        return self.with_gate(images)[0]
+        check(images)
+        return self.drawn_on(images, self.drawn(padded(images, self.config.multiple, self.config.smallest_side)))[0]
 
     def with_gate(self, images: Tensor) -> tuple[Tensor, Tensor | None]:
         """The derained images, and what gated the change, (B, 1, H, W) in 0..1, where the network draws it."""
         check(images)
+        drawn = self.drawn(padded(images, self.config.multiple, self.config.smallest_side))
+        derained, opened = self.drawn_on(images, drawn)
         height, width = images.shape[2:]
-        drawn = self.network(padded(images, self.config.multiple, self.config.smallest_side))[:, :, :height, :width]
-        change, gate = drawn[:, :RGB].tanh(), None
+        return derained, None if opened is None else self._pixels(opened)[:, :, :height, :width]
+
+    def drawn_on(self, images: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor | None]:
+        """The derained images, and what gated the change, (B, patch^2, H / patch, W / patch), from what the head drew,
+        which is at least as large as the images.
+
+        Everything that is bounded is so before channels become pixels: in that order a processor is thrice as fast.
+        """
+        height, width = images.shape[2:]
+        seen = RGB * self.config.patch**2
+        change, opened = drawn[:, :seen].tanh(), None
         if self.config.output_gate:
-            gate = drawn[:, RGB:].sigmoid()
-            change = change * gate
+            opened = drawn[:, seen:].sigmoid()
+            change = change * opened.repeat(1, RGB, 1, 1)
+        change = self._pixels(change)[:, :, :height, :width]
         derained = images + change if self.config.output_residual else (change + 1) / 2
-        return (derained if self.training else derained.clamp(0, 1)), gate
+        return (derained if self.training else derained.clamp(0, 1)), opened
+
+    def _pixels(self, features: Tensor) -> Tensor:
+        return pixel_shuffle(features, self.config.patch) if self.config.patch > 1 else features
 
     def network(self, images: Tensor) -> Tensor:
         """What the head draws, unbounded: (B, 3 or 4, H, W). Sides must be multiples of `config.multiple`."""
+        return self._pixels(self.drawn(images))
+
+    def drawn(self, images: Tensor) -> Tensor:
+        """The same before its channels become pixels: (B, 3 or 4 times patch^2, H / patch, W / patch)."""
         if self.config.patch > 1:
             images = pixel_unshuffle(images, self.config.patch)
         features = self.stem(images)
@@ -213,7 +233,7 @@ class Generator(nn.Module):
         for step, blocks in zip(self.ups, self.decoder_blocks, strict=True):
             features = blocks(step(features) + skips.pop())
         drawn: Tensor = self.head(features)
-        return pixel_shuffle(drawn, self.config.patch) if self.config.patch > 1 else drawn
+        return drawn
 
 
 def _gathered(layer: nn.Conv2d | nn.ConvTranspose2d) -> float:

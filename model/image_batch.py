@@ -6,6 +6,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 RGB = 3
+INPUT = {"channels": RGB, "range": [0.0, 1.0], "colour": "rgb"}
+"""What a card says of the images that its network takes, and what networks of this package do take."""
 
 
 def check(images: Tensor) -> None:

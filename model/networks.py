@@ -8,7 +8,10 @@ from typing import Any, Protocol, cast
 import torch
 from torch import Tensor, nn
 
+from rainstereo.model.cell_generator import CellGenerator, supported
+from rainstereo.model.generator import Generator, GeneratorConfig
 from rainstereo.model.image_batch import padded
+from rainstereo.model.receptive_field import halo
 
 PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16, "float16": torch.float16}
 WITHOUT_A_CARD = 512
@@ -20,7 +23,8 @@ class Network(Protocol):
 
     device: where it wants its input. multiple: sides that it computes on are multiples of this; tiles must begin on
     one. halo: pixels to the farthest that an output depends on. local: whether nothing else matters, so that a tile
-    with its halo comes out as in the whole image. name: for reports.
+    with its halo comes out as in the whole image. name: for reports. cells: computes some cells of an image alone,
+    where that can be done.
     """
 
     device: torch.device
@@ -28,6 +32,7 @@ class Network(Protocol):
     halo: int
     local: bool
     name: str
+    cells: CellGenerator | None
 
     def __call__(self, images: Tensor) -> Tensor:
         """The restored images."""
@@ -47,6 +52,8 @@ class TorchNetwork:
         # `.to(memory_format)` of a module has no types
         self.module = cast(Any, module.eval().to(self.device, kind)).to(memory_format=torch.channels_last)
         self.kind, self.name = kind, f"torch {self.precision} on {self.device}"
+        able = isinstance(module, Generator) and supported(module.config)
+        self.cells = CellGenerator(self.module, kind) if able else None
 
     def __call__(self, images: Tensor) -> Tensor:
         """The restored images, on the same device."""
@@ -76,6 +83,7 @@ class OnnxNetwork:
             raise ValueError(f"{path} is not a de-rainer that rainstereo exported; make one with rainstereo export")
         self.device, self.name = torch.device("cpu"), f"onnxruntime {onnxruntime.__version__}, {path.name}"
         self.multiple, self.halo, self.local = int(told["multiple"]), int(told["halo"]), told["local"] == "yes"
+        self.cells: CellGenerator | None = None
         self.smallest, self.input = int(told["smallest_side"]), inputs[0].name
 
     def __call__(self, images: Tensor) -> Tensor:
@@ -88,9 +96,6 @@ class OnnxNetwork:
 
 def reach(module: nn.Module) -> tuple[int, int, bool]:
     """(multiple, halo, whether tiles equal the frame) of a network, from its configuration."""
-    from rainstereo.model.generator import GeneratorConfig
-    from rainstereo.model.receptive_field import halo
-
     config = getattr(module, "config", None)
     if isinstance(config, GeneratorConfig):
         return config.multiple, halo(config), config.tiles_equal_frame

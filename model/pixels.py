@@ -32,15 +32,25 @@ def to_rgb(image: Image, device: torch.device) -> Tensor:
     return rgb.float().div_(float(np.iinfo(image.dtype).max)).unsqueeze(0)
 
 
+def to_batch(images: Image, device: torch.device) -> Tensor:
+    """(N, H, W[, 3]) images of one size as (N, 3, H, W) float32 in 0..1."""
+    count, height, width = images.shape[:3]
+    tall = to_rgb(images.reshape(count * height, width, *images.shape[3:]), device)
+    return tall.view(3, count, height, width).transpose(0, 1)
+
+
 def from_rgb(rgb: Tensor, like: Image) -> Image:
     """(3, H, W) in 0..1 as an image of the type and channels of another; gray is the mean of the channels."""
+    found: Image = from_batch(rgb.unsqueeze(0), like[None])[0]
+    return found
+
+
+def from_batch(rgb: Tensor, like: Image) -> Image:
+    """(N, 3, H, W) in 0..1 as (N, H, W[, 3]) images of the type and channels of others."""
     most = int(np.iinfo(like.dtype).max)
-    levels = (
-        rgb.float().mul(most).round_().clamp_(0, most) if like.ndim == 3 else rgb.float().mean(0).mul_(most).round_()
-    )
-    if like.ndim == 3:
-        levels = levels.flip(0).permute(1, 2, 0)
-    levels = levels.clamp_(0, most)
     kind = torch.uint8 if like.dtype == np.uint8 else torch.int32
-    found: Image = np.ascontiguousarray(levels.to(kind).cpu().numpy()).astype(like.dtype, copy=False)
+    values = rgb.float() if like.ndim == 4 else rgb.float().mean(1, keepdim=True)
+    levels = values.mul(most).round_().clamp_(0, most).to(kind).permute(0, 2, 3, 1)
+    levels = levels.flip(3) if like.ndim == 4 else levels[..., 0]
+    found: Image = np.ascontiguousarray(levels.cpu().numpy()).astype(like.dtype, copy=False)
     return found

@@ -6,11 +6,13 @@
     clear = restorer(cv2.imread("photo.png"))
 
 An image without drops costs the detector and a copy, and comes back bit for bit; so does every cell of 16 pixels of
-any image in which the detector sees no drop. What is left is computed in rectangles with some of the image around them.
+any image in which the detector sees no drop. What is left is computed cell by cell, or, by networks that cannot do
+that, in rectangles with some of the image around them.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,11 +23,14 @@ import numpy as np
 import torch
 
 from rainstereo.model import checkpoint as checkpoints
+from rainstereo.model import detector
 from rainstereo.model.architecture import ARCHITECTURES
+from rainstereo.model.cell_generator import CellGenerator, patches
 from rainstereo.model.detector import CELL, CERTAIN, THRESHOLD, Detector, factor_for
+from rainstereo.model.image_batch import INPUT
 from rainstereo.model.networks import Network, OnnxNetwork, TorchNetwork, pick_device
-from rainstereo.model.pixels import check, from_rgb, to_rgb
-from rainstereo.model.tiles import Grid, Rect, Rows, covering, ramped, strips
+from rainstereo.model.pixels import check, from_batch, from_rgb, to_batch, to_rgb
+from rainstereo.model.tiles import Grid, Rect, Rows, coarser, covering, ramped, strips
 from rainstereo.types import Array, Image, Mask
 
 Backend = Literal["torch", "onnx"]
@@ -33,8 +38,11 @@ Checkpoint = str | os.PathLike[str]
 
 MAX_PIXELS = 4 << 20
 """What is computed at once, halo included; larger images are tiled."""
-SKIP_HALO = 32
-"""Pixels of the image around what holds drops that the generator sees, when the rest is skipped."""
+CELLS_HALO, PARTS_HALO = 0, 32
+"""Pixels of the image around what holds drops that the generator sees, when the rest is skipped: computed by cells,
+or in rectangles. From the curve of `rainstereo bench derain`: more costs time, and hardly raises the quality."""
+BY_CELLS = 1.45
+"""What a pixel costs when single cells are computed, over what it costs in a whole image."""
 RAMP = 4
 """Pixels within a marked cell over which the restored image replaces the given one."""
 OVERLAP = 32
@@ -62,7 +70,7 @@ class Restorer:
     "float16". backend: "torch" or "onnx".
     tile: side, pixels, of the tiles of large images; None: by what may be computed at once, max_pixels.
     skip: whether cells without drops are left as they are; threshold, certain: see `Detector`. halo: pixels that the
-    generator sees around what has drops. A detector of one's own may be given.
+    generator sees around what has drops; None: what pays. A detector of one's own may be given.
     network: in place of a checkpoint, anything that is a `Network`.
 
     ValueError where the checkpoint is not for such images.
@@ -71,10 +79,10 @@ class Restorer:
     def __init__(
         self, checkpoint: Checkpoint | None = None, device: str | torch.device = "auto", precision: str = "auto",
         tile: int | None = None, skip: bool = True, backend: Backend = "torch", *, threshold: float = THRESHOLD,
-        certain: float = CERTAIN, halo: int = SKIP_HALO, max_pixels: int = MAX_PIXELS,
+        certain: float = CERTAIN, halo: int | None = None, max_pixels: int = MAX_PIXELS,
         detector: Detector | None = None, network: Network | None = None,
     ) -> None:  # fmt: skip
-        if halo < 0 or (tile is not None and tile < 4 * CELL) or max_pixels < 1 << 16:
+        if (halo is not None and halo < 0) or (tile is not None and tile < 4 * CELL) or max_pixels < 1 << 16:
             raise ValueError(
                 f"halo {halo}, tile {tile}, max_pixels {max_pixels} were given; expected a halo of 0 or more, a tile "
                 f"of at least {4 * CELL} and at least {1 << 16} pixels at once"
@@ -83,7 +91,9 @@ class Restorer:
         self.detector = (detector or Detector.shipped("cpu", threshold, certain)) if skip else None
         step = self.network.multiple
         self.step = step if step % CELL == 0 else int(np.lcm(step, CELL))
-        self.halo, self.max_pixels = -(-halo // self.step) * self.step, max_pixels
+        self.by_cells: CellGenerator | None = getattr(self.network, "cells", None)
+        around = halo if halo is not None else CELLS_HALO if self.by_cells else PARTS_HALO
+        self.halo, self.max_pixels = -(-around // self.step) * self.step, max_pixels
         self._tile = tile
 
     def __call__(self, image: Image) -> Image:
@@ -112,7 +122,7 @@ class Restorer:
                 found[i] = self.restored(image)
                 continue
             cells = self.marked(image)
-            if cells.any() and self.parts(cells, image) == [_whole(image)]:
+            if cells.any() and self.plan(cells, image) == [_whole(image)]:
                 whole.setdefault((*image.shape, image.dtype.itemsize), []).append((i, cells))
             else:
                 found[i] = self.with_cells(image, cells)
@@ -149,9 +159,14 @@ class Restorer:
             return np.ones((-(-image.shape[0] // CELL), -(-image.shape[1] // CELL)), bool)
         return self.detector.cells(image, factor)
 
-    def parts(self, cells: Mask, image: Image) -> list[Rect]:
-        """What the generator must see for these cells: rectangles of the image, or the whole of it."""
-        parts = covering(cells, CELL, self.halo, self.step, (image.shape[0], image.shape[1]), CALL)
+    def plan(self, cells: Mask, image: Image) -> list[Rect] | Mask:
+        """What the generator computes for these cells: rectangles of the image, or the whole of it, or cells of its
+        own size; the least work."""
+        size = image.shape[0], image.shape[1]
+        if self.by_cells is not None:
+            where = coarser(cells, CELL, self.by_cells.cell, self.halo, size)
+            return where if BY_CELLS * where.sum() < WHOLE * where.size else [_whole(image)]
+        parts = covering(cells, CELL, self.halo, self.step, size, CALL)
         return [_whole(image)] if sum(part.area for part in parts) >= WHOLE * _area(image) else parts
 
     def with_cells(self, image: Image, cells: Mask, base: Image | None = None) -> Restored:
@@ -159,8 +174,10 @@ class Restorer:
         out = (image if base is None else base).copy()
         if not cells.any():
             return Restored(out, 0.0, 0.0)
-        parts = self.parts(cells, image)
-        for part in parts:
+        plan = self.plan(cells, image)
+        if not isinstance(plan, list):
+            return Restored(out, float(cells.mean()), self._cell_by_cell(image, cells, plan, out) / _area(image))
+        for part in plan:
             restored = self.whole(image[part.slices])
             top, left, bottom, right = (
                 part.top // CELL,
@@ -169,7 +186,24 @@ class Restorer:
                 -(-part.right // CELL),
             )
             _pasted(out, restored, part, cells[top:bottom, left:right])
-        return Restored(out, float(cells.mean()), sum(part.area for part in parts) / _area(image))
+        return Restored(out, float(cells.mean()), sum(part.area for part in plan) / _area(image))
+
+    def _cell_by_cell(self, image: Image, cells: Mask, where: Mask, out: Image) -> int:
+        """Restore the marked cells, which lie in the cells `where` something is computed; how many pixels were."""
+        made = self.by_cells
+        assert made is not None  # noqa: S101
+        given = patches(image, where, made.cell, made.border)
+        inner = slice(made.border, made.border + made.cell)
+        restored = from_batch(made(to_batch(given, self.network.device), where), given[:, inner, inner])
+        weight = ramped(cells, CELL, (image.shape[0], image.shape[1]), RAMP)
+        for whole, row, column in zip(restored, *np.nonzero(where), strict=True):
+            rows = slice(row * made.cell, (row + 1) * made.cell)
+            columns = slice(column * made.cell, (column + 1) * made.cell)
+            mix, before = weight[rows, columns], out[rows, columns]
+            mix = mix[..., None] if out.ndim == 3 else mix
+            found = whole[: before.shape[0], : before.shape[1]].astype(np.float32)
+            before[...] = np.rint(before + mix * (found - before))
+        return len(restored) * made.cell**2
 
     def whole(self, image: Image) -> Image:
         """The image through the generator, as it is: no skipping, no tiles."""
@@ -229,6 +263,13 @@ def _pasted(out: Image, restored: Image, part: Rect, cells: Mask) -> Image:
     return out
 
 
+def leaves_out() -> str:
+    """Changes when anything does that decides, by default, which cells are left as they are."""
+    weights = detector.shipped().read_bytes()
+    settings = THRESHOLD, CERTAIN, CELLS_HALO, PARTS_HALO, RAMP, BY_CELLS, WHOLE, CALL
+    return hashlib.sha256(weights + repr(settings).encode()).hexdigest()
+
+
 # -- checkpoints -------------------------------------------------------------------------------------------------------
 
 
@@ -267,10 +308,12 @@ def restores(found: checkpoints.Checkpoint) -> None:
             f"{found.path} holds {found.architecture or 'something unnamed'}; expected what restores images: "
             + ", ".join(sorted(ARCHITECTURES))
         )
-    data = found.card.get("input", {})
-    channels, span = data.get("channels", 3), list(data.get("range", (0, 1)))
-    if channels != 3 or span != [0, 1]:
+    told = found.card.get("input", {})  # cards without it are of RGB in 0 .. 1
+    told = told if isinstance(told, dict) else {"channels": told}
+    wrong = ", ".join(f"{name} {told[name]}" for name, ours in INPUT.items() if told.get(name, ours) != ours)
+    if wrong:
         raise ValueError(
-            f"{found.path} is for images of {channels} channels with values in {span[0]} .. {span[-1]}; photographs "
-            "come as 3 channels in 0 .. 1. Take another checkpoint"
+            f"{found.path} is for other images than photographs are: {wrong}; expected "
+            + ", ".join(f"{name} {ours}" for name, ours in INPUT.items())
+            + ". Take another checkpoint"
         )

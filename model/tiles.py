@@ -50,6 +50,24 @@ class Rect:
         return Rect(self.top - other.top, self.left - other.left, self.bottom - other.top, self.right - other.left)
 
 
+def coarser(marked: Mask, cell: int, wide: int, halo: int, size: tuple[int, int]) -> Mask:
+    """Which cells of `wide` pixels of an image of (height, width) hold a marked one of `cell` pixels, or lie within
+    `halo` of one."""
+    shape = -(-size[0] // wide), -(-size[1] // wide)
+    found: Mask = np.zeros(shape, bool)
+    rows, columns = np.nonzero(marked)
+    spread = max(1, cell // wide)  # wide cells along a side of a small one, where they are smaller
+    for i in range(spread):
+        for j in range(spread):
+            down, right = rows * cell // wide + i, columns * cell // wide + j
+            inside = (down < shape[0]) & (right < shape[1])
+            found[down[inside], right[inside]] = True
+    reach = -(-halo // wide)
+    if reach:
+        found = cv2.dilate(found.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
+    return found
+
+
 def covering(marked: Mask, cell: int, halo: int, step: int, size: tuple[int, int], call: int = 0) -> list[Rect]:
     """Rectangles, with their halo, that hold all marked cells of an image of (height, width), for the least work.
 

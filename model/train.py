@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from rainstereo.model import checkpoint
 from rainstereo.model.augmentation import Augmentation
 from rainstereo.model.dataset import WHOLE, Batch, Rain, Sample, Steps, Windows, loader, whole
+from rainstereo.model.image_batch import INPUT
 from rainstereo.model.misalignment import misaligned
 from rainstereo.model.pair_folders import Item, find
 from rainstereo.model.recipe import Recipe, parse, plain
@@ -63,6 +64,8 @@ class Run:
     """Seconds of them in which a step waited for data, since the last start."""
     begun_at: int = 0
     """Steps that had been done at the last start."""
+    begun_share: float = 0.0
+    """`progress` then."""
     best: float = -math.inf
     """PSNR of the best validation."""
     latest: dict[str, float] = field(default_factory=dict)
@@ -99,7 +102,7 @@ def _fit(recipe: Recipe, out: Path, listener: Listener, rank: int, world: int, d
     augmentation = Augmentation(recipe.augment) if on_device else None
     run = Run(recipe, out, Trainer(recipe, device, rank, world), items, validation)
     _resume(run, listener)
-    run.begun_at = run.trainer.done
+    run.begun_at, run.begun_share = run.trainer.done, run.progress
     log = _Table(out / LOSSES, rank == 0)
     log.cut(run.trainer.done)
     validator = _Validator(run, listener, rank == 0, windows)
@@ -155,6 +158,7 @@ def card_of(run: Run) -> dict[str, Any]:
         "notes": recipe.notes or None,
         "architecture": recipe.architecture,
         "config": dataclasses.asdict(trainer.config),
+        "input": INPUT,
         "steps": trainer.done,
         "batch": recipe.optimizer.batch,
         "elapsed_s": round(run.elapsed, 3),

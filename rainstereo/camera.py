@@ -87,6 +87,10 @@ class Camera:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write mrcal's `.cameramodel`; mrcal's own tools open it."""
+        Path(path).write_text(self.text(), encoding="utf-8")
+
+    def text(self) -> str:
+        """What `save` writes."""
         model = {
             "lensmodel": self.model,
             "intrinsics": self.intrinsics,
@@ -94,7 +98,7 @@ class Camera:
             "imagersize": [self.width, self.height],
             **self.carried,
         }
-        Path(path).write_text(cameramodel.text(model), encoding="utf-8")
+        return cameramodel.text(model)
 
     def with_pose(self, rt_cam_ref: Array) -> Camera:
         """The same camera elsewhere."""

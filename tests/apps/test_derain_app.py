@@ -5,6 +5,7 @@ import json
 import shutil
 import struct
 import subprocess
+import tracemalloc
 import zlib
 from pathlib import Path
 from typing import Any
@@ -163,6 +164,24 @@ def test_big_images_equal_small_ones(weights: Path, own: Restorer, tmp_path: Pat
     assert (found.dtype, found.shape) == (image.dtype, image.shape)
     assert np.abs(found.astype(int) - own(image)).max() <= (1 if image.dtype == np.uint8 else 300)
     assert report(tmp_path / "out")["images"][0]["streamed"]
+
+
+@pytest.mark.usefixtures("everything_is_big")
+def test_memory_does_not_grow_with_the_height(weights: Path, tmp_path: Path) -> None:
+    """Of all that numpy and Python hold; torch has one tile at a time."""
+    peaks = []
+    for height in (300, 600, 2400):
+        path = tmp_path / f"in/{height}.ppm"
+        put(path, np.tile(picture(1, (300, 64)), (height // 300, 1, 1)))
+        out = tmp_path / f"out{height}"
+        tracemalloc.start()
+        try:
+            assert run(weights, path, out, *FAST, "--format", "tif", "--tile", "64", "--max-megapixels", "0.0625") == 0
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+        assert len(imagefile.read(out / f"{height}.tif")) == height
+    assert abs(peaks[2] - peaks[1]) < 0.05 * peaks[1] + 30_000  # a whole image more would be 350 kB more
 
 
 @pytest.mark.usefixtures("everything_is_big")

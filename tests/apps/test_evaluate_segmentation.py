@@ -2,23 +2,25 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from rainstereo import imagefile
 from rainstereo.apps.cli import main
 from rainstereo.apps.evaluation_sets import RenderedRain
 from rainstereo.apps.segmentation_page import as_theirs, legend, overlaid
+from rainstereo.model import checkpoint, segmentation_training
 from rainstereo.model.restore import Restorer
 from rainstereo.model.segmentation import CAMVID11
 from rainstereo.model.segmentation_metrics import binary, confusion
 from rainstereo.types import Image
-from tests.model.small_restorer import saved
+from tests.model.small_restorer import CONFIG, generator, saved
 
 SMALL = ("--steps", "2", "--batch", "2", "--crop", "32", "--base-channels", "2", "--no-skip", "--device", "cpu")
 CONDITIONS = ["REFERENCE", "RAINY", "AUGMENTED", "DERAINED", "RESTORED ONLY"]
@@ -108,7 +110,36 @@ def test_one_command_makes_the_table_and_keeps_what_it_made(
     assert report(out)["sets"] == found
     with pytest.raises(pytest.fail.Exception, match="was trained"):
         evaluate(weights, out, *sets, "--debug", "--rate", "0.002")
-    monkeypatch.undo()
+
+
+def test_other_weights_remake_what_depends_on_them_and_no_more(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, out = drive(tmp_path / "drive"), tmp_path / "out"
+    assert evaluate(weights, out, f"markings:{folder}") == 0
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.png")}
+    first, trained, train = report(out)["sets"]["markings-drive"], list[str](), segmentation_training.train
+
+    def told(*given: Any) -> None:
+        trained.append(given[3].stem)
+        train(*given)
+
+    monkeypatch.setattr(segmentation_training, "train", told)
+    other = generator()
+    torch.nn.init.normal_(other.head.weight, 0, 0.1)
+    card = {"architecture": "generator", "config": asdict(CONFIG)}
+    assert evaluate(checkpoint.save(tmp_path / "other", other, card), out, f"markings:{folder}") == 0
+    assert trained == ["clear+derained"]
+    again = {path for path, when in before.items() if path.stat().st_mtime_ns != when}
+    states = {path.relative_to(out / "markings-drive").parts[0] for path in again}
+    assert states == {"derained", "predicted"}
+    conditions = {
+        path.relative_to(out / "markings-drive/predicted").parts[0] for path in again if "predicted" in str(path)
+    }
+    assert conditions == {"derained", "restored-only"}
+    second = report(out)["sets"]["markings-drive"]
+    for same in ("REFERENCE", "RAINY", "AUGMENTED"):
+        assert second["conditions"][same] == first["conditions"][same]
 
 
 def test_networks_of_an_earlier_run_are_used_and_what_cannot_be_read_is_named(weights: Path, tmp_path: Path) -> None:

@@ -106,6 +106,45 @@ def test_the_command_trains_and_says_what_it_did(tmp_path: Path, capsys: pytest.
     assert "ends in .safetensors" in " ".join(capsys.readouterr().err.split())
 
 
+def test_the_command_learns_from_banks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "clear").mkdir()
+    (tmp_path / "bank/masks").mkdir(parents=True)
+    for name in "ab":
+        clear = cv2.resize(picture(ord(name), (24, 32)), (300, 230))
+        rainy, opacity = clear.copy(), np.zeros((230, 300), np.uint8)
+        opacity[50:150, 60:200] = 255
+        rainy[opacity > 0] = cv2.blur(clear, (31, 31))[opacity > 0]
+        imagefile.write(tmp_path / f"clear/{name}.png", clear)
+        imagefile.write(tmp_path / f"bank/{name}.png", rainy)
+        imagefile.write(tmp_path / f"bank/masks/{name}.png", np.dstack([0 * opacity, opacity, opacity]))
+    given = ["detector", str(tmp_path / "clear"), "--steps", "10", "--batch", "2", "--pool", "3"]
+    first, second = tmp_path / "d.safetensors", tmp_path / "e.safetensors"
+    assert main([*given, "--banks", str(tmp_path / "bank"), "--out", str(first)]) == 0
+    assert "folders of rainstereo rain: bank" in str(detector.card(first)["rain"])
+    more = ("--banks", str(tmp_path / "bank"), "--start", str(first), "--out", str(second))
+    assert main([*given, *more]) == 0
+    assert first.read_bytes() != second.read_bytes()
+    assert main([*given, "--banks", str(tmp_path), "--out", str(second)]) == 2
+    assert "holds no masks of these images" in " ".join(capsys.readouterr().err.split())
+
+
+def test_labels_and_weights_of_cut_crops() -> None:
+    clear = np.full((64, 64, 3), 100, np.uint8)
+    rainy, opacity = clear.copy(), np.zeros((64, 64), np.float32)
+    opacity[:, 32:] = 1
+    rainy[:32, 32:], rainy[32:, 32:] = 200, 101
+    bank = detector_training.Rained(clear, rainy, opacity)
+    pool = detector_training.cut(lambda _: bank, 1, (64, 64), np.random.default_rng(0))
+    label, weight = pool.labels[0, 0], pool.weights[0, 0]
+    if not label[0, -1]:  # the crop came mirrored
+        label, weight = label.flip(-1), weight.flip(-1)
+    assert label.sum() == 128
+    assert label[:, 8:].all()
+    assert (weight[:, :8] == 1).all()
+    assert (weight[:8, 8:] == 3).all()  # 100 levels off: the most
+    assert (weight[8:, 8:] == torch.tensor(0.1)).all()  # one level off: the least
+
+
 def test_the_packages_detector_knows_rain_from_none(shared_data: Path) -> None:
     """On frames that it was not trained on."""
     assert detector.shipped().stat().st_size <= 200_000

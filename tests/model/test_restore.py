@@ -14,7 +14,7 @@ from rainstereo.model import checkpoint
 from rainstereo.model.frame_sequence import FrameSequence
 from rainstereo.model.pixels import from_rgb, to_rgb
 from rainstereo.model.restore import Restorer
-from rainstereo.model.tiles import Grid, Rect, covering, ramped, strips
+from rainstereo.model.tiles import Grid, Rect, coarser, covering, ramped, strips
 from rainstereo.types import Image
 from tests.model.small_restorer import CONFIG, RedDetector, generator, network, picture, saved, with_drop
 
@@ -141,6 +141,58 @@ def test_clear_cells_pass_and_marked_ones_are_restored() -> None:
     assert skipping(skip=False, halo=48)(image).tolist() == whole.tolist()
 
 
+ZEROS = replace(CONFIG, padding="zeros", normalisation="none", patch=4)  # which can be computed by cells, of 16 pixels
+
+
+def by_cells(**more: object) -> Restorer:
+    return Restorer(network=network(ZEROS), detector=RedDetector(), **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["colour", "gray", "deep"])
+def test_marked_cells_are_computed_alone(kind: str) -> None:
+    image = picture(5, (310, 475))
+    image = {"colour": image, "gray": image[..., 0].copy(), "deep": image.astype(np.uint16) * 257}[kind]
+    image = with_drop(with_drop(image, 40, 40), 305, 470)
+    image[40, 40] = image[305, 470] = (0, 0, np.iinfo(image.dtype).max) if image.ndim == 3 else 255
+    before, made = image.copy(), by_cells()
+    found, cells = made.restored(image), RedDetector().cells(image)
+    marked = np.repeat(np.repeat(cells, 16, 0), 16, 1)[:310, :475]
+    assert np.array_equal(image, before)
+    assert np.array_equal(found.image[~marked], image[~marked])
+    assert found.computed == pytest.approx(2 * 16 * 16 / image[..., :1].size if image.ndim == 3 else 512 / image.size)
+    whole = Restorer(network=network(ZEROS), skip=False)(image)
+    wide = by_cells(halo=64)(image)  # what a cell depends on lies within
+    inner = slice(36, 44), slice(36, 44)  # inside the ramp
+    assert np.array_equal(wide[inner], whole[inner])
+    assert not np.array_equal(found.image[inner], image[inner])
+
+
+def test_all_cells_marked_are_the_whole_image() -> None:
+    image = picture(6, (100, 90))
+    made = by_cells()
+    found = made.with_cells(image, np.ones((7, 6), bool))
+    assert found.computed == 1
+    assert np.array_equal(found.image, made.whole(image))
+    most = np.ones((7, 6), bool)
+    most[3, 2] = False
+    assert made.with_cells(image, most).computed == 1  # not worth its while to leave out one
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32), st.sampled_from([4, 8, 16, 32, 64]), st.sampled_from([0, 16, 32, 50]))
+def test_wide_cells_hold_the_marked_ones(seed: int, wide: int, halo: int) -> None:
+    size = (205, 333)
+    marked = np.random.default_rng(seed).random((13, 21)) < 0.05
+    pixels = np.kron(marked, np.ones((16, 16)))[:205, :333] > 0
+    reach = -(-halo // wide) * wide
+    down, right = -205 % wide, -333 % wide
+    held = np.pad(pixels, ((0, down), (0, right)))  # an independent formulation: by pixels
+    coarse = held.reshape(held.shape[0] // wide, wide, -1, wide).any((1, 3))
+    grown = cv2.dilate(np.kron(coarse, np.ones((wide, wide))).astype(np.uint8), np.ones((2 * reach + 1,) * 2)) > 0
+    expected = grown.reshape(coarse.shape[0], wide, -1, wide).any((1, 3))
+    assert np.array_equal(coarser(marked, 16, wide, halo, size), expected)
+
+
 def test_ramps_stay_inside_what_is_marked() -> None:
     marked = np.zeros((6, 6), bool)
     marked[2:4, 2:5] = True
@@ -192,8 +244,10 @@ def test_checkpoints_for_other_data_are_refused(tmp_path: Path) -> None:
     good = saved(tmp_path / "good")
     assert np.array_equal(Restorer(good, skip=False)(picture()), restorer()(picture()))
     for name, more, words in (
-        ("gray", {"input": {"channels": 1}}, "1 channels"),
-        ("range", {"input": {"range": [-1, 1]}}, "-1 .. 1"),
+        ("gray", {"input": {"channels": 1}}, "channels 1; expected channels 3"),
+        ("range", {"input": {"range": [-1, 1]}}, r"range \[-1, 1\]; expected"),
+        ("blue", {"input": {"colour": "bgr", "channels": 3}}, "colour bgr"),
+        ("words", {"input": "photographs"}, "photographs"),
         ("role", {"architecture": "discriminator"}, "holds discriminator; expected what restores"),
     ):
         with pytest.raises(ValueError, match=words):
