@@ -19,7 +19,7 @@ from rainstereo.types import Array, Image
 
 _CONTRAST = 0.4  # a corner is one if its contrast is at least this share of the first corners' median
 _FEWEST = 6
-_ENOUGH = 0.7  # share of the tags read with which the doubled image need not be searched
+_ENOUGH, _FEW = 0.7, 3  # share of the tags read with which no enlarged image is searched; tags, with which no third
 _WINDOW = 0.85  # half window of the refinement, in what is clear about a corner
 _NEAREST, _FAR = 16, 3.0  # corners that guess another one: how many, and how far they may be in sides of a tag
 _SHARES = (0.45, 0.75)  # of the way to the edge of the frame or the square, where gray levels are compared
@@ -53,14 +53,16 @@ def find_aprilgrid(search: Image, fine: Image, board: Board) -> Detection:
 
 
 def _tags(search: Image, board: Board) -> tuple[Array, Array]:
-    """Numbers (M,) and corners (M, 4, 2) of the tags that can be read, each once; small ones in a doubled image."""
+    """Numbers (M,) and corners (M, 4, 2) of the tags that can be read, each once; small ones in an enlarged image."""
     found: dict[int, Array] = {}
-    for scale in (1, 2):
-        image = search if scale == 1 else cv2.resize(search, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    for scale, enough in ((1, _ENOUGH * np.prod(board.shape)), (2, _FEW), (3, 0)):
+        image = search
+        if scale > 1:
+            image = cv2.resize(search, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         identities, quads = find_markers(cv2.dilate(image, np.ones((3, 3), np.uint8)), board)
         for identity, quad in zip(identities.tolist(), quads, strict=True):
             found.setdefault(identity, (quad - (scale - 1) / 2) / scale)
-        if len(found) >= _ENOUGH * np.prod(board.shape):
+        if len(found) >= enough:
             break
     return np.array(list(found), dtype=int), np.reshape(list(found.values()), (-1, 4, 2))
 
