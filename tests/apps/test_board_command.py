@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rainstereo.apps import board as command
+from rainstereo.apps import simulate
 from rainstereo.apps.board_sheet import paper_size
 from rainstereo.apps.cli import main
 from rainstereo.calib import board_file, corners
@@ -151,6 +152,16 @@ def test_a_measured_description_is_never_overwritten(tmp_path: Path) -> None:
     assert "25.04" in described.read_text()
     assert out.read_bytes() == before
     assert Board.parse(str(described)).square == 25.04 / 1000
+
+
+def test_simulate_takes_a_description(tmp_path: Path) -> None:
+    """calibrate reads its board with the same `Board.parse`."""
+    file = tmp_path / "b.toml"
+    file.write_text(board_file.description(Board.parse("aprilgrid:5x3:24mm:0.3")))
+    options = simulate.Options(tmp_path / "out", boards=(str(file),), frames=2, bare_frames=0, drive_frames=0)
+    plan = simulate.simulation(options)
+    assert [capture.board.spec for capture in plan.captures] == ["aprilgrid:5x3:24mm:0.3"]
+    assert [capture.name for capture in plan.captures] == ["aprilgrid"]
 
 
 def test_paper_sizes() -> None:

@@ -56,7 +56,7 @@ def test_a_twist_of_a_fifth_of_a_millimetre_is_found(tilt: float | None, monkeyp
     assert [f.text for f in verdict.findings if "twisted: its corners stand 0.20 +- 0.00 mm" in f.text]
 
 
-@pytest.mark.parametrize("tilt", [None, 15.0])
+@pytest.mark.parametrize("tilt", [None, pytest.param(15.0, marks=pytest.mark.slow)])
 def test_a_flat_board_is_not_called_twisted(tilt: float | None) -> None:
     inside = None if tilt is None else synthetic.chamber(tilt)
     found = board_shape.examine(solve(observed(inside, 1), MODEL, inside))

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("mrcal", reason="mrcal is not installed")
 
-from rainstereo.calib import adjust, board_shape, irregular, uncertainty
+from rainstereo.calib import adjust, board_shape, information, irregular, uncertainty
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.board import Board
 from rainstereo.calib.mrcal_versions import Free, Problem
@@ -94,6 +94,18 @@ def test_noise_ends_where_it_was_predicted_to() -> None:
     expected = uncertainty.stereo_infinity_uncertainty(solution)
     assert uncertainty.infinity_error(solution.rig, true).stereo.rms < expected.rms_limit(3.5)
     assert solution.rig.dry.carried
+
+
+def test_thinned_boards_tell_as_much_as_the_regular_boards_that_they_are() -> None:
+    """Guidance asks what every second corner of a board would say; for an AprilGrid these stand at equal steps."""
+    problem = problem_of(GRID, 3)
+    assert problem.lattice is not None
+    poses, weight = synthetic.poses(2, 9, GRID, near=0.2, far=0.4), np.ones((2, 2, 3, 4))
+    ours = information.of_poses(problem, None, poses, weight, 2 * problem.spacing)
+    regular = problem.copy(spacing=GRID.square * 1.5, observations=problem.observations[:, ::2, ::2], lattice=None)
+    theirs = information.of_poses(regular, None, poses, weight, regular.spacing)
+    # the bending is counted from the rim of the corners that there are, in both
+    assert np.abs(ours - theirs).max() < 1e-9 * np.abs(theirs).max()
 
 
 def test_a_lattice_too_fine_for_mrcal_is_left_out_of_the_file() -> None:
