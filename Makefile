@@ -51,7 +51,7 @@ pictures: env
 	for name in $$(grep -oh 'images/[a-z0-9/.-]*' README.md docs/tutorial.md | sort -u); do \
 	  mkdir -p "docs/$$(dirname $$name)" && cp "$(OUT)/pictures/$${name#images/}" "docs/$$name"; done
 
-# The weights that the package ships. CAMVID: a folder that holds CamVid's train and val images. Two hours on 2 cores.
+# The weights that the package ships. CAMVID: a folder that holds CamVid's train and val images. Three and a half hours on 2 cores.
 COVERS = 0.35 0.2 0.5 0.28 0.65 0.42 0.08 0.3 0.4 0.55 0.24 0.75
 weights: env
 	@test -d "$(CAMVID)/train" -a -d "$(CAMVID)/val" || { echo "give CAMVID=FOLDER, with CamVid's images in FOLDER/train and FOLDER/val"; exit 1; }

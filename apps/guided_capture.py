@@ -71,7 +71,7 @@ def anywhere(truth: Rig, board: Board, rng: np.random.Generator, tilt_deg: float
         ray = truth.dry.unproject(rng.uniform(0, np.array(truth.dry.size) - 1.0))
         direction, lean = rng.uniform(-math.pi, math.pi), math.radians(tilt_deg) * rng.uniform()
         r = np.array([lean * math.cos(direction), lean * math.sin(direction), rng.uniform(-0.35, 0.35)])
-        pose = np.concatenate([r, ray / ray[2] * depth - rotation_matrix(r) @ middle])
+        pose: Array = np.concatenate([r, ray / ray[2] * depth - rotation_matrix(r) @ middle])
         if _held(truth, board, pose):
             return pose
     raise ValueError(f"{board.spec} does not fit into the view of both cameras; give a smaller board")

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -21,8 +22,9 @@ from rich.console import Console
 from rainstereo import Rig
 from rainstereo.apps import arrivals, watch, watch_session
 from rainstereo.apps.arrivals import Arrivals
+from rainstereo.apps.board_poses import board_poses
 from rainstereo.apps.cli import main
-from rainstereo.apps.digital_rig import digital_rig, exact_observations
+from rainstereo.apps.digital_rig import RigOptions, digital_rig, exact_observations
 from rainstereo.apps.guided_capture import anywhere, unsteady
 from rainstereo.apps.watch_page import PAGE
 from rainstereo.apps.watch_screen import Screen
@@ -38,7 +40,7 @@ from rainstereo.rig import ROLES
 pytest.importorskip("mrcal")
 
 BOARD = Board.parse("chessboard:10x7:22mm")
-LENS = "LENSMODEL_OPENCV5"
+LENS: Literal["LENSMODEL_OPENCV5"] = "LENSMODEL_OPENCV5"
 PAIRS = 9
 
 
@@ -46,11 +48,10 @@ class Folder:
     """A capture: image files whose corners are known already, so that no board need be drawn or found."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.cache, self.truth = path / "capture", path / "corners", digital_rig(seed=1)
+        self.path, self.cache, self.truth = path / "capture", path / "corners", digital_rig(RigOptions(lens=LENS), 1)
         self.path.mkdir()
         rng = np.random.default_rng(2)
-        poses = np.stack([anywhere(self.truth, BOARD, rng) for _ in range(PAIRS)])
-        seen = exact_observations(self.truth, BOARD, poses)
+        seen = exact_observations(self.truth, BOARD, board_poses(self.truth, BOARD, PAIRS, 1))
         self.corners = {role: xy + rng.normal(0, 0.1, xy.shape) for role, xy in zip(ROLES, seen, strict=True)}
 
     def image(self, role: str, number: int, *, size: tuple[int, int] = (1280, 960), board: bool = True) -> bytes:
