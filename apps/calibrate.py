@@ -18,7 +18,7 @@ from rainstereo.apps.calibration_page import page
 from rainstereo.apps.calibration_slab import slab_results
 from rainstereo.apps.cli import DONE, FAILED
 from rainstereo.apps.run_record import Record
-from rainstereo.calib import checks, consistency, mrcal_versions, panel_checks, uncertainty
+from rainstereo.calib import board_shape, checks, consistency, mrcal_versions, panel_checks, uncertainty
 from rainstereo.calib.board import Board
 from rainstereo.calib.cross_validation import choose_lensmodel
 from rainstereo.calib.hypotheses import Hypothesis, compare
@@ -37,7 +37,9 @@ class Options:
 
     board: str
     """What is printed on the board: chessboard:9x6:25mm (inner corners, side of a square), or
-    charuco:31x16:49.33mm:38.46mm:DICT_4X4_1000 (squares, their side, side of a marker, dictionary)."""
+    charuco:31x16:49.33mm:38.46mm:DICT_4X4_1000 (squares, their side, side of a marker, dictionary), or
+    aprilgrid:6x6:88mm:0.3 (tags, side of a tag, gap in sides of a tag: Kalibr's); or the description that
+    rainstereo board writes, FILE.toml."""
     out: Path
     """Rig folder to write: dry.cameramodel, wet.cameramodel, chamber.toml, report.html, report.json."""
     dry: str = ""
@@ -112,9 +114,9 @@ def examine(options: Options, captures: Captures, clock: Clock) -> Findings:
         verdict = checks.judge_failure(observations, error, FALLBACK)
         return Findings(observations, None, None, choice, verdict, None)
     covariance = uncertainty.covariance(solution)
-    expected = options.expected_baseline_mm
+    expected, shape = options.expected_baseline_mm, board_shape.examine(solution)
     verdict = checks.judge(
-        observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance
+        observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance, shape=shape
     )
     clock("uncertainty and checks")
     hypotheses: tuple[Hypothesis, ...] = ()
@@ -127,7 +129,7 @@ def examine(options: Options, captures: Captures, clock: Clock) -> Findings:
         comparisons = consistency.compare(solution)
         verdict = checks.Verdict((*verdict.findings, *consistency.doubts(comparisons)))
         clock("cross-validation")
-    return Findings(observations, solution, covariance, choice, verdict, chamber, comparisons, hypotheses)
+    return Findings(observations, solution, covariance, choice, verdict, chamber, comparisons, hypotheses, shape)
 
 
 class Clock:
@@ -253,6 +255,7 @@ def results(findings: Findings, clock: Clock) -> dict[str, object]:
         "dropped": solution.dropped,
         "reordered": solution.reordered,
         "board_warp_m": solution.calobject_warp,
+        "board_shape": findings.shape,
         "refraction": solution.passes,
         "panels": slab_results(findings),
         "solve_seconds": solution.solve_seconds,

@@ -10,6 +10,7 @@ import numpy as np
 
 from rainstereo import Chamber
 from rainstereo.calib import contributions, point_uncertainty, range_uncertainty, uncertainty
+from rainstereo.calib.board_shape import BoardShape
 from rainstereo.calib.checks import Verdict
 from rainstereo.calib.consistency import Comparison
 from rainstereo.calib.contributions import CORNERS, Contributions
@@ -37,7 +38,7 @@ class Findings:
     """All that a calibration found out; `solution` and what hangs on it are None where it failed.
 
     comparisons: of parts of the capture with each other; None where that was not asked for. hypotheses: about the
-    panels; empty where there are none.
+    panels; empty where there are none. shape: of the board beyond what is modelled.
     """
 
     observations: Observations
@@ -48,6 +49,7 @@ class Findings:
     chamber: Chamber | None
     comparisons: tuple[Comparison, ...] | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
+    shape: BoardShape | None = None
 
     @cached_property
     def spread(self) -> Contributions | None:

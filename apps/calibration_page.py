@@ -12,6 +12,7 @@ from rainstereo.apps.calibration_trust import agreement, limiting, reach
 from rainstereo.apps.capture_next import capture_next
 from rainstereo.apps.report import Mood, Report, Tile, quantity
 from rainstereo.apps.run_record import Record
+from rainstereo.calib.board_shape import BoardShape
 from rainstereo.calib.cross_validation import Choice
 from rainstereo.calib.solve import Solution
 from rainstereo.pose import invert, transform
@@ -40,7 +41,7 @@ def page(findings: Findings, record: Record) -> Report:
         _fit(report, solution)
         _scene(report, solution)
         _frames(report, solution)
-        _cameras(report, solution)
+        _cameras(report, solution, findings.shape)
     if findings.choice is not None:
         _models(report, findings.choice)
     if findings.observations.rejected:
@@ -109,9 +110,9 @@ def _fit(report: Report, solution: Solution) -> None:
 def _scene(report: Report, solution: Solution) -> None:
     report.section("Boards and cameras", "Boards should stand near and far, tilted each another way.")
     rig = solution.rig
-    rows, columns = solution.residuals["dry"].shape[1:3]
-    spacing = solution.problem.spacing
-    outline = spacing * np.array([[-1, -1, 0], [columns, -1, 0], [columns, rows, 0], [-1, rows, 0]], dtype=np.float64)
+    s = solution.problem.spacing
+    x, y, _ = solution.problem.board()[-1, -1] + s
+    outline = np.array([[-s, -s, 0], [x, -s, 0], [x, y, 0], [-s, y, 0]], dtype=np.float64)
     boards = np.stack([transform(rt, outline) for rt in solution.rt_ref_board])
     frusta: dict[str, Array] = {role: _frustum(rig, role) for role in ROLES}
     panels = None if rig.chamber is None else _panels(rig.chamber)
@@ -134,7 +135,7 @@ def _frames(report: Report, solution: Solution) -> None:
         report.table(("frame", "why it was not used"), [(drop.name, drop.reason) for drop in solution.dropped])
 
 
-def _cameras(report: Report, solution: Solution) -> None:
+def _cameras(report: Report, solution: Solution, shape: BoardShape | None) -> None:
     rig = solution.rig
     rt = rig.rt_wet_dry
     centre = invert(rt)[3:] * 1000
@@ -150,8 +151,14 @@ def _cameras(report: Report, solution: Solution) -> None:
     report.text(
         f"The wet camera stands {abs(centre[0]):.2f} mm to the {side} of the dry one, {centre[1]:+.2f} mm down and "
         f"{centre[2]:+.2f} mm ahead, turned by {turn:.3f} degrees. The board is bent by "
-        f"{bent[0]:.2f} mm along its columns and {bent[1]:.2f} mm along its rows."
+        f"{bent[0]:.2f} mm along its columns and {bent[1]:.2f} mm along its rows{_twist(shape)}."
     )
+
+
+def _twist(shape: BoardShape | None) -> str:
+    if shape is None:
+        return ""
+    return f" and twisted by {1000 * shape.twist:.3f} +- {1000 * shape.twist_sigma:.3f} mm, which is not modelled"
 
 
 def _models(report: Report, choice: Choice) -> None:

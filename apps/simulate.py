@@ -26,7 +26,7 @@ from rainstereo.rig import ROLES
 from rainstereo.sensor import Sensor
 from rainstereo.types import Image
 
-FOLDERS = r"truth|drive|live|(chessboard|charuco)(-[0-9]+)?"
+FOLDERS = r"truth|drive|live|(chessboard|charuco|aprilgrid)(-[0-9]+)?"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,9 @@ class Options:
     out: Path
     """Folder to write; made if missing."""
     boards: tuple[str, ...] = ("chessboard:9x6:25mm", "charuco:11x8:25mm:19mm:DICT_4X4_250")
-    """Boards to capture: chessboard:WxH:SQUARE (inner corners) or charuco:WxH:SQUARE:MARKER:DICTIONARY (squares)."""
+    """Boards to capture: chessboard:WxH:SQUARE (inner corners), charuco:WxH:SQUARE:MARKER:DICTIONARY (squares),
+    aprilgrid:WxH:TAG:SPACING (tags, gaps in sides of a tag), or a description as rainstereo board writes it,
+    FILE.toml."""
     frames: int = 20
     """Poses of each board behind the chamber."""
     bare_frames: int = 20

@@ -265,8 +265,7 @@ def _require_seen(place: _Place, panels: Panels, behind: Mask, u: Array, status:
 
 
 def _board(problem: Problem, warp: Array | None) -> Array:
-    rows, columns = problem.observations.shape[1:3]
-    return versions.board_points(rows, columns, problem.spacing, warp)
+    return problem.board(warp)
 
 
 def _range(span: slice) -> Array:
