@@ -155,7 +155,7 @@ def _tile_work(shipped: Network, image: Image, quick: bool) -> Work:
         whole = Restorer(network=shipped, skip=skip, max_pixels=1 << 24)
         error = partial(_levels, truth=whole(image))
         variants.append(Variant(f"whole frame{words}", partial(whole, image), error))
-        for tile in (64, 128) if quick else (256, 512):
+        for tile in (64,) if quick else (512,):
             made = Restorer(network=shipped, skip=skip, tile=tile, max_pixels=1 << 16)
             variants.append(Variant(f"tiles of {tile}{words}", partial(made, image), error, True, every=5))
     return Work(

@@ -71,7 +71,8 @@ class Options:
     hold: int = 1
     """Video: looks of the detector after which a place that is clear again is left alone."""
     reuse: float | None = None
-    """Video: gray levels within which a place that did not change keeps its restored pixels."""
+    """Video: gray levels within which a place that did not change keeps its restored pixels. 8 cost 0.1 dB, and half
+    the time where the camera stands; less than the sensor's noise keeps nothing."""
     overwrite: bool = False
     """Replace what other settings made in OUT."""
     sheet: bool = True

@@ -124,7 +124,7 @@ def test_inputs_and_checkpoints_without_sense_are_refused(
         (weights, tmp_path / "none", "out", "does not exist"),
         (weights, tmp_path / "in", "in/out", "lie in one another"),
         (weights, "camera:front", "out", "expected a camera's number"),
-        (other, tmp_path / "in", "out", "for images of 1 channels"),
+        (other, tmp_path / "in", "out", "channels 1; expected channels 3"),
     ):
         assert run(checkpoint, images, tmp_path / out, *FAST) == 2
         assert words in " ".join(capsys.readouterr().err.split())
