@@ -25,6 +25,7 @@ STAGES: dict[str, str] = {
     "calibration": "rainstereo.apps.bench_calibration",
     "cavity": "rainstereo.apps.bench_cavity",
     "guidance": "rainstereo.apps.bench_guidance",
+    "slab": "rainstereo.apps.bench_slab",
     "drops": "rainstereo.apps.bench_drops",
     "rain": "rainstereo.apps.bench_rain",
     "align": "rainstereo.apps.bench_align",
@@ -45,8 +46,8 @@ class Options:
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What: refraction, warp, calibration, cavity, guidance, drops, rain, align, record, select, train, derain, or
-    all."""
+    """What: refraction, warp, calibration, slab, cavity, guidance, drops, rain, align, record, select, train, derain,
+    or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15

@@ -95,7 +95,8 @@ def _candidates(
 def _outline(board: Board) -> Array:
     """Border of the printed squares and half a square of white around them, (40, 3) metres."""
     s = board.square
-    x0, y0, x1, y1 = -1.5 * s, -1.5 * s, (board.columns + 0.5) * s, (board.rows + 0.5) * s
+    x0 = y0 = -board.margin - 0.5 * s
+    x1, y1 = (length - board.margin + 0.5 * s for length in board.size)
     t = np.linspace(0, 1, 10, endpoint=False)
     x = np.concatenate([x0 + (x1 - x0) * t, np.full(10, x1), x1 + (x0 - x1) * t, np.full(10, x0)])
     y = np.concatenate([np.full(10, y0), y0 + (y1 - y0) * t, np.full(10, y1), y1 + (y0 - y1) * t])

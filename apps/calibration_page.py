@@ -2,50 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 
 from rainstereo import Chamber, Rig
 from rainstereo.apps import figures
+from rainstereo.apps.calibration_findings import STEREO, Findings
+from rainstereo.apps.calibration_slab import slab_section
+from rainstereo.apps.calibration_trust import agreement, limiting, reach
+from rainstereo.apps.capture_next import capture_next
 from rainstereo.apps.report import Mood, Report, Tile, quantity
 from rainstereo.apps.run_record import Record
-from rainstereo.calib import uncertainty
-from rainstereo.calib.checks import Verdict
+from rainstereo.calib.board_shape import BoardShape
 from rainstereo.calib.cross_validation import Choice
-from rainstereo.calib.observations import Observations
 from rainstereo.calib.solve import Solution
-from rainstereo.calib.uncertainty import Covariance, UncertaintyMap
 from rainstereo.pose import invert, transform
 from rainstereo.rig import ROLES
 from rainstereo.types import Array
 
 _MOODS: dict[str, Mood] = {"good": "good", "doubtful": "warn", "refused": "bad"}
-STEREO = "wet against dry"
 
-
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """All that a calibration found out; `solution` and what hangs on it are None where it failed."""
-
-    observations: Observations
-    solution: Solution | None
-    covariance: Covariance | None
-    choice: Choice | None
-    verdict: Verdict
-    chamber: Chamber | None
-
-    @cached_property
-    def infinity(self) -> dict[str, UncertaintyMap]:
-        """Predicted uncertainty at infinity: of each camera, and of the wet pixel that belongs to a dry one."""
-        if self.solution is None or self.covariance is None:
-            return {}
-        fields: dict[str, UncertaintyMap] = {
-            role: uncertainty.infinity_uncertainty(self.solution, role, gauge="image", cov=self.covariance)
-            for role in ROLES
-        }
-        return {**fields, STEREO: uncertainty.stereo_infinity_uncertainty(self.solution, cov=self.covariance)}
+__all__ = ["STEREO", "Findings", "page"]
 
 
 def page(findings: Findings, record: Record) -> Report:
@@ -56,11 +32,16 @@ def page(findings: Findings, record: Record) -> Report:
     solution = findings.solution
     if solution is not None:
         _tiles(report, solution, findings)
+        reach(report, solution, findings)
+        limiting(report, findings)
+        slab_section(report, solution, findings)
+        agreement(report, solution, findings)
+        corners = {role: _corners(solution, role) for role in ROLES}
+        capture_next(report, solution, findings.observations.board, corners)
         _fit(report, solution)
-        _reach(report, solution, findings)
         _scene(report, solution)
         _frames(report, solution)
-        _cameras(report, solution)
+        _cameras(report, solution, findings.shape)
     if findings.choice is not None:
         _models(report, findings.choice)
     if findings.observations.rejected:
@@ -78,7 +59,7 @@ def _verdict(report: Report, findings: Findings) -> None:
         far = findings.infinity[STEREO].typical
         words = (
             f"Far away the two images are aligned to {quantity(far, 'px', 2)} (one sigma), the baseline is known to "
-            f"{quantity(1000 * uncertainty.baseline_sigma(solution, findings.covariance), 'mm', 2)}."
+            f"{quantity(1000 * findings.baseline_sigma(), 'mm', 2)}."
         )
         report.verdict(_MOODS[status], words + (" See the doubts below." if status == "doubtful" else ""))
     if findings.verdict.findings:
@@ -90,12 +71,17 @@ def _verdict(report: Report, findings: Findings) -> None:
 
 
 def _tiles(report: Report, solution: Solution, findings: Findings) -> None:
-    sigma = uncertainty.baseline_sigma(solution, findings.covariance)
+    sigma, deep = findings.baseline_sigma(), findings.made_of.get("depth at 2 m", {})
     report.tiles(
-        Tile("RMS per coordinate", quantity(solution.rms_px), "px", "inliers; per point: x 1.41"),
+        Tile(
+            "RMS per coordinate",
+            quantity(solution.rms_px),
+            "px",
+            f"{solution.outlier_count} of {solution.corner_count} corners rejected",
+        ),
         Tile("baseline", f"{1000 * solution.rig.baseline:.3f}", "mm", f"+- {quantity(1000 * sigma, 'mm', 2)}"),
         Tile("at infinity", quantity(findings.infinity[STEREO].typical, digits=2), "px", "wet against dry, one sigma"),
-        Tile("pairs", len(solution.names), "", f"{solution.outlier_count} of {solution.corner_count} corners rejected"),
+        Tile("depth at 2 m", quantity(float(np.sqrt(sum(deep.values()))), digits=2), "mm", "one sigma, one match"),
         Tile("lens model", solution.lensmodel.removeprefix("LENSMODEL_").split("_")[0], "", _acrylic(solution)),
     )
 
@@ -121,34 +107,12 @@ def _fit(report: Report, solution: Solution) -> None:
         )
 
 
-def _reach(report: Report, solution: Solution, findings: Findings) -> None:
-    report.section(
-        "Where it can be trusted",
-        "A low RMS says nothing about places where no board was held. These maps do: the uncertainty of a direction "
-        "at infinity, predicted from the corners used.",
-    )
-    top = max(float(np.nanpercentile(field.sigma, 95)) for field in findings.infinity.values())
-    for name, field in findings.infinity.items():
-        camera = solution.rig.dry if name == STEREO else solution.rig.camera("wet" if name == "wet" else "dry")
-        title = f"{name} camera" if name != STEREO else "wet pixel that belongs to a dry pixel"
-        report.figure(
-            figures.heat_map(field.sigma, camera.size, "px", title=title, top=top),
-            f"One sigma in the worst direction; median {quantity(field.typical, 'px', 2)}."
-            + (" What stays in aligned pairs of far scenes." if name == STEREO else ""),
-        )
-    for role in ROLES:
-        report.figure(
-            figures.coverage(_corners(solution, role), solution.rig.camera(role).size, title=f"{role} camera"),
-            "Cells without a corner are where the next board should be held.",
-        )
-
-
 def _scene(report: Report, solution: Solution) -> None:
     report.section("Boards and cameras", "Boards should stand near and far, tilted each another way.")
     rig = solution.rig
-    rows, columns = solution.residuals["dry"].shape[1:3]
-    spacing = solution.problem.spacing
-    outline = spacing * np.array([[-1, -1, 0], [columns, -1, 0], [columns, rows, 0], [-1, rows, 0]], dtype=np.float64)
+    s = solution.problem.spacing
+    x, y, _ = solution.problem.board()[-1, -1] + s
+    outline = np.array([[-s, -s, 0], [x, -s, 0], [x, y, 0], [-s, y, 0]], dtype=np.float64)
     boards = np.stack([transform(rt, outline) for rt in solution.rt_ref_board])
     frusta: dict[str, Array] = {role: _frustum(rig, role) for role in ROLES}
     panels = None if rig.chamber is None else _panels(rig.chamber)
@@ -171,7 +135,7 @@ def _frames(report: Report, solution: Solution) -> None:
         report.table(("frame", "why it was not used"), [(drop.name, drop.reason) for drop in solution.dropped])
 
 
-def _cameras(report: Report, solution: Solution) -> None:
+def _cameras(report: Report, solution: Solution, shape: BoardShape | None) -> None:
     rig = solution.rig
     rt = rig.rt_wet_dry
     centre = invert(rt)[3:] * 1000
@@ -187,8 +151,14 @@ def _cameras(report: Report, solution: Solution) -> None:
     report.text(
         f"The wet camera stands {abs(centre[0]):.2f} mm to the {side} of the dry one, {centre[1]:+.2f} mm down and "
         f"{centre[2]:+.2f} mm ahead, turned by {turn:.3f} degrees. The board is bent by "
-        f"{bent[0]:.2f} mm along its columns and {bent[1]:.2f} mm along its rows."
+        f"{bent[0]:.2f} mm along its columns and {bent[1]:.2f} mm along its rows{_twist(shape)}."
     )
+
+
+def _twist(shape: BoardShape | None) -> str:
+    if shape is None:
+        return ""
+    return f" and twisted by {1000 * shape.twist:.3f} +- {1000 * shape.twist_sigma:.3f} mm, which is not modelled"
 
 
 def _models(report: Report, choice: Choice) -> None:

@@ -33,6 +33,10 @@ COMMANDS: dict[str, Command] = {
     "simulate": Command(
         "a recording by a digital rig, and the truth about it", "rainstereo simulate --out out/recording"
     ),
+    "board": Command(
+        "a calibration board to print at exact scale, and its description",
+        "rainstereo board chessboard:9x6:25mm --out board.pdf",
+    ),
     "calibrate": Command(
         "board images to a rig folder, through the acrylic",
         "rainstereo calibrate --dry boards/dry --wet boards/wet --board chessboard:9x6:25mm --out rig",

@@ -118,7 +118,7 @@ def heat_map(
     mesh = axes.pcolormesh(x, y, grid, cmap=RAIN, vmin=0, vmax=top, shading="gouraud")
     mesh.set_rasterized(True)
     if levels is None:
-        levels = _ladder(float(known.min()), top) if known.size and np.ptp(known) > 0 else []
+        levels = ladder(float(known.min()), top) if known.size and np.ptp(known) > 0 else []
     if len(levels) > 0 and known.size:
         dark = "#0b1a29"  # not INK: this lies on the colours, whatever the page
         lines = axes.contour(x, y, grid, levels=sorted(levels), colors=dark, linewidths=0.7)
@@ -301,7 +301,7 @@ def _round_to_125(value: float) -> float:
     return float(power * max(step for step in (1, 2, 5) if step * power <= value * 1.0000001))
 
 
-def _ladder(low: float, high: float) -> list[float]:
+def ladder(low: float, high: float) -> list[float]:
     """Values 1, 2, 5 x 10^k between two ends."""
     if not (0 < high < float("inf")):
         return []

@@ -26,7 +26,7 @@ from rainstereo.rig import ROLES
 from rainstereo.sensor import Sensor
 from rainstereo.types import Image
 
-FOLDERS = r"truth|drive|live|(chessboard|charuco)(-[0-9]+)?"
+FOLDERS = r"truth|drive|live|(chessboard|charuco|aprilgrid)(-[0-9]+)?"
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,15 @@ class Options:
     out: Path
     """Folder to write; made if missing."""
     boards: tuple[str, ...] = ("chessboard:9x6:25mm", "charuco:11x8:25mm:19mm:DICT_4X4_250")
-    """Boards to capture: chessboard:WxH:SQUARE (inner corners) or charuco:WxH:SQUARE:MARKER:DICTIONARY (squares)."""
+    """Boards to capture: chessboard:WxH:SQUARE (inner corners), charuco:WxH:SQUARE:MARKER:DICTIONARY (squares),
+    aprilgrid:WxH:TAG:SPACING (tags, gaps in sides of a tag), or a description as rainstereo board writes it,
+    FILE.toml."""
     frames: int = 20
     """Poses of each board behind the chamber."""
     bare_frames: int = 20
     """Poses of each board without the chamber; 0: no such capture."""
+    still: bool = False
+    """Rig and board stand still while the chamber is put in: the capture without it shows the same poses."""
     near_m: float | None = None
     """Nearest board, metres; by default 0.3, or where a larger board fills the frame."""
     far_m: float | None = None
@@ -161,7 +165,7 @@ def _captures(options: Options, rig: Rig, name: str, board: Board, seed: tuple[i
     for through, frames in ((False, options.bare_frames), (True, options.frames)):
         if frames:
             poses = board_poses(
-                rig, board, frames, (*seed, int(through)), through=through,
+                rig, board, frames, (*seed, int(through or options.still)), through=through or options.still,
                 near=options.near_m, far=options.far_m, tilt_deg=options.board_tilt_deg,
             )  # fmt: skip
             captures.append(Capture(name, board, through, poses))

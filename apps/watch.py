@@ -17,7 +17,8 @@ import numpy as np
 
 from rainstereo import Chamber
 from rainstereo.apps import calibrate
-from rainstereo.apps.calibration_page import Findings
+from rainstereo.apps.calibration_captures import Captures
+from rainstereo.apps.calibration_findings import Findings
 from rainstereo.apps.run_record import Record
 from rainstereo.apps.watch_page import PAGE
 from rainstereo.apps.watch_screen import Screen
@@ -155,7 +156,8 @@ def _final(session: Session, options: calibrate.Options, chamber: Chamber | None
         return _nothing(session, len(pairs), rejected, str(error))
     clock("detection")
     observations = replace(observations, rejected=(*observations.rejected, *rejected))
-    return calibrate.examine(options, observations, chamber, clock)
+    captures = Captures(observations, chamber, None, (observations, chamber))
+    return calibrate.examine(options, captures, clock)
 
 
 def _nothing(session: Session, pairs: int, rejected: list[Rejection], why: str = "") -> Findings:

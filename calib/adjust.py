@@ -94,7 +94,7 @@ def begin(points: Array, corners: Array, names: tuple[str, ...], sizes: list[tup
     failure: Exception | None = None
     for guess in seeding.seed(points, corners, sizes, reversible=reversible):
         try:
-            attempt = _from_seed(guess, corners, names, sizes, spacing)
+            attempt = _from_seed(guess, corners, names, sizes, spacing, lattice_of(points, spacing))
             for free in (POSES, CORE):
                 attempt.problem.free = free
                 if not approach(attempt.problem):
@@ -109,13 +109,13 @@ def begin(points: Array, corners: Array, names: tuple[str, ...], sizes: list[tup
 
 
 def _from_seed(guess: seeding.Seed, corners: Array, names: tuple[str, ...], sizes: list[tuple[int, int]],
-               spacing: float) -> Adjustment:  # fmt: skip
+               spacing: float, lattice: tuple[Array, Array] | None) -> Adjustment:  # fmt: skip
     corners = corners.copy()
     if len(corners) > 1:
         corners[1, guess.flipped] = corners[1, guess.flipped][:, ::-1, ::-1]
     seen = np.isfinite(guess.rt_ref_board[:, 0])
     placed = seen & (guess.apart < seeding.AGREE)
-    problem = assemble(corners[:, placed], sizes, spacing)
+    problem = assemble(corners[:, placed], sizes, spacing, lattice)
     problem.lensmodel = guess.lens
     centres = (np.asarray(sizes) - 1) / 2
     problem.intrinsics = np.column_stack([guess.focals, guess.focals, centres])
@@ -133,7 +133,17 @@ def _from_seed(guess: seeding.Seed, corners: Array, names: tuple[str, ...], size
     )
 
 
-def assemble(corners: Array, sizes: list[tuple[int, int]], spacing: float) -> Problem:
+def lattice_of(points: Array, spacing: float) -> tuple[Array, Array] | None:
+    """Where columns and rows of a board's corners stand, if that is not at steps of `spacing`."""
+    x, y = points[0, :, 0], points[:, 0, 1]
+    if all(np.allclose(np.diff(along), spacing, rtol=1e-9) for along in (x, y)):
+        return None
+    return np.array(x), np.array(y)
+
+
+def assemble(
+    corners: Array, sizes: list[tuple[int, int]], spacing: float, lattice: tuple[Array, Array] | None = None
+) -> Problem:
     """A problem from corners, (cameras, F, rows, columns, 2), NaN where unseen; its state is still zero."""
     cameras, frames = corners.shape[:2]
     seen = np.isfinite(corners[..., 0])
@@ -150,6 +160,7 @@ def assemble(corners: Array, sizes: list[tuple[int, int]], spacing: float) -> Pr
         indices=np.column_stack([frame, camera, camera - 1]).astype(np.int32),
         sizes=np.array(sizes, dtype=np.int32),
         spacing=spacing,
+        lattice=lattice,
     )
 
 
@@ -238,13 +249,23 @@ def approach(problem: Problem) -> bool:
     sparse = np.ascontiguousarray(problem.observations[:, ::2, ::2])
     enough = np.zeros(len(problem.rt_ref_board))
     np.add.at(enough, problem.indices[:, 0], (sparse[..., 2] > 0).sum((1, 2)))
+    if problem.lattice is not None and not _alternating(problem.lattice):
+        return False
     if observed(problem).sum() < PLENTY or enough.min() < 2 * seeding.MIN_CORNERS:
         return False
     trial = problem.copy(observations=sparse, spacing=2 * problem.spacing)
+    if problem.lattice is not None:  # every second corner of an AprilGrid: equal steps, which mrcal solves
+        trial.spacing, trial.lattice = float(problem.lattice[0][2] - problem.lattice[0][0]), None
     versions.optimize(trial)
     problem.intrinsics, problem.rt_cam_ref = trial.intrinsics, trial.rt_cam_ref
     problem.rt_ref_board = trial.rt_ref_board
     return True
+
+
+def _alternating(lattice: tuple[Array, Array]) -> bool:
+    """Whether every second column and row stand at equal steps, the same along both."""
+    steps = np.concatenate([np.diff(along[::2]) for along in lattice])
+    return len(steps) > 0 and bool(np.allclose(steps, steps[0], rtol=1e-9))
 
 
 def like_stereographic(count: int) -> list[float]:

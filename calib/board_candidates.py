@@ -68,8 +68,8 @@ def candidates(rig: Rig, board: Board) -> Candidates:
 
 def outline(board: Board, border: float = 0.0, steps: int = 4) -> Array:
     """The edge of the printed squares and a border around it, in squares: (4 steps, 3) metres, closed implicitly."""
-    s = board.square
-    low, right, bottom = -(1 + border) * s, (board.columns + border) * s, (board.rows + border) * s
+    low = -board.margin - border * board.square
+    right, bottom = (length - 2 * board.margin - low for length in board.size)
     t = np.linspace(0, 1, steps, endpoint=False)
     full, none = np.ones(steps), np.zeros(steps)
     x = np.concatenate([low + (right - low) * t, full * right, right + (low - right) * t, full * low])
@@ -80,12 +80,12 @@ def outline(board: Board, border: float = 0.0, steps: int = 4) -> Array:
 def mesh(board: Board, steps: int = 5) -> Array:
     """Lines between squares from edge to edge, (L, steps, 3) metres: every one, or every second or third and so on of
     a board of many squares."""
-    across, down = np.linspace(-1, board.columns, steps), np.linspace(-1, board.rows, steps)
-    columns = np.arange(0, board.columns, max(round(board.columns / 6), 1))
-    rows = np.arange(0, board.rows, max(round(board.rows / 6), 1))
+    across, down = (np.linspace(-board.margin, length - board.margin, steps) for length in board.size)
+    columns = board.points[0, :: max(round(board.columns / 6), 1), 0]
+    rows = board.points[:: max(round(board.rows / 6), 1), 0, 1]
     lines = [np.column_stack([np.full(steps, column), down, np.zeros(steps)]) for column in columns]
     lines += [np.column_stack([across, np.full(steps, row), np.zeros(steps)]) for row in rows]
-    return np.asarray(board.square * np.stack(lines))
+    return np.stack(lines)
 
 
 def drawn(rig: Rig, poses: Array, points: Array) -> Array:

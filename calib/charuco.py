@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from rainstereo.calib.board import Board, aruco_dictionary
+from rainstereo.calib.board import TAG_BORDER, TAGS, Board, aruco_dictionary
 from rainstereo.calib.detection import Detection, nothing
 from rainstereo.calib.saddles import checker, contrast_of, refine, spacing_of, steps
 from rainstereo.types import Array, Image, Mask
@@ -25,6 +25,8 @@ def find_markers(search: Image, board: Board, dictionary: str | None = None) -> 
     parameters.minMarkerPerimeterRate = 0.01
     parameters.minMarkerDistanceRate = 0.01
     parameters.perspectiveRemovePixelPerCell = 8
+    if board.kind == "aprilgrid" and dictionary is None:
+        dictionary, parameters.markerBorderBits = TAGS, TAG_BORDER
     name = dictionary or board.dictionary or ""
     quads, identities, _ = cv2.aruco.ArucoDetector(aruco_dictionary(name), parameters).detectMarkers(search)
     if identities is None or len(identities) == 0:

@@ -14,6 +14,7 @@ import numpy as np
 
 from rainstereo import pose
 from rainstereo.calib import mismatch, uncertainty
+from rainstereo.calib.board_shape import BoardShape, examine
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.refracted import ChamberError
 from rainstereo.calib.seed import StereoError
@@ -37,6 +38,7 @@ COVER_DOUBTFUL, COVER_CELLS = 0.4, (8, 6)
 BASELINE_OFF = 0.05
 SYSTEMATIC_PX, CELL_CORNERS = 0.2, 8
 FOCALS_OFF = 0.1
+SHAPE_SIGMAS, SHAPE_DOUBTFUL_PX = 5.0, 0.1
 
 MORE_VIEWS = (
     "take 15 or more pairs: the board tilted by 30 degrees, each time another way, near and far, all over the image"
@@ -74,8 +76,12 @@ def judge(
     *,
     expected_baseline: float | None = None,
     cov: Covariance | None = None,
+    shape: BoardShape | None = None,
 ) -> Verdict:
-    """Judge a solution. expected_baseline: metres, if known from the rig's drawing; cov: its covariance, if at hand."""
+    """Judge a solution. expected_baseline: metres, if known from the rig's drawing.
+
+    cov: its covariance, and shape: what `board_shape.examine` says, if at hand.
+    """
     cov = uncertainty.covariance(solution) if cov is None else cov
     findings = [
         *views(solution),
@@ -83,6 +89,7 @@ def judge(
         *certainty(solution, cov),
         *fit(observations, solution),
         *pattern(solution),
+        *board(examine(solution) if shape is None else shape),
         *losses(observations, solution),
         *geometry(solution, expected_baseline),
     ]
@@ -238,6 +245,24 @@ def systematic(solution: Solution, camera: int) -> float:
     return float(np.sqrt(max(total, 0) / count)) if count else 0.0
 
 
+def board(shape: BoardShape | None) -> list[Finding]:
+    """Whether the board is twisted or rippled, which the calibration does not model."""
+    if shape is None or max(shape.twist_sigmas, shape.ripple_sigmas) < SHAPE_SIGMAS:
+        return []
+    told = []
+    if shape.twist_sigmas >= SHAPE_SIGMAS:
+        told.append(
+            f"twisted: its corners stand {abs(shape.twist) * 1000:.2f} +- {shape.twist_sigma * 1000:.2f} mm out of the "
+            f"plane ({shape.twist_sigmas:.0f} sigmas), which moves the wet pixel of a point at infinity by up to "
+            f"{shape.moved.max:.2f} px"
+        )
+    if shape.ripple_sigmas >= SHAPE_SIGMAS:
+        told.append(f"rippled by {shape.ripple * 1000:.2f} mm ({shape.ripple_sigmas:.0f} sigmas)")
+    twisted = shape.twist_sigmas >= SHAPE_SIGMAS and shape.moved.max > SHAPE_DOUBTFUL_PX
+    remedy = "glue the print onto glass or an aluminium plate, or leave it as it is if that is good enough"
+    return [Finding("doubtful" if twisted else "note", f"the board is {' and '.join(told)}", remedy)]
+
+
 def losses(observations: Observations, solution: Solution) -> list[Finding]:
     """Frames and corners that the calibration had to do without."""
     found = [Finding("note", f"not used: {drop.reason}", "", (drop.name,)) for drop in solution.dropped]
@@ -294,5 +319,4 @@ def geometry(solution: Solution, expected_baseline: float | None) -> list[Findin
 
 
 def _board_extent(solution: Solution) -> float:
-    rows, columns = solution.problem.observations.shape[1:3]
-    return solution.problem.spacing * (rows + columns - 2) / 2
+    return float(solution.problem.board()[-1, -1, :2].sum()) / 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from rainstereo.calib.aprilgrid import find_aprilgrid
 from rainstereo.calib.board import Board
 from rainstereo.calib.charuco import find_charuco, find_markers
 from rainstereo.calib.chessboard import checkered, chessboard_of, extent, find_chessboard, refined_chessboard
@@ -32,11 +33,12 @@ def detect(image: Image, board: Board, *, legacy: bool | None = None, diagnose: 
     search = _eight_bits(gray)
     fine = gray.astype(np.float32)
     cv2.setRNGSeed(0)  # OpenCV's sector-based search draws random numbers; the same image gives the same corners
-    found = (
-        find_chessboard(search, fine, board)
-        if board.kind == "chessboard"
-        else find_charuco(search, fine, board, legacy)
-    )
+    if board.kind == "aprilgrid":
+        found = find_aprilgrid(search, fine, board)
+    elif board.kind == "charuco":
+        found = find_charuco(search, fine, board, legacy)
+    else:
+        found = find_chessboard(search, fine, board)
     if diagnose and not found and not found.seen:
         seen = _what_is_there(search, fine, board)
         found = nothing(board, f"{found.reason}; this image shows {seen or 'no other board either'}", seen)
@@ -45,7 +47,7 @@ def detect(image: Image, board: Board, *, legacy: bool | None = None, diagnose: 
 
 def decided_by_colour(board: Board) -> bool:
     """Whether the print tells corner [0, 0] from its opposite: always with markers, else if columns + rows is odd."""
-    return board.kind == "charuco" or (board.columns + board.rows) % 2 == 1
+    return board.kind != "chessboard" or (board.columns + board.rows) % 2 == 1
 
 
 def indistinguishable(xy: Array, board: Board) -> list[Array]:

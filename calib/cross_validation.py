@@ -112,7 +112,7 @@ def _thinned(observations: Observations) -> Observations:
     """Every second corner in each direction, where there are plenty."""
     board = observations.board
     count = sum(int(np.isfinite(observations.xy(role)[..., 0]).sum()) for role in ROLES)
-    if count < ENOUGH_CORNERS or min(board.rows, board.columns) < 8:
+    if count < ENOUGH_CORNERS or min(board.rows, board.columns) < 8 or board.kind == "aprilgrid":
         return observations
     dry, wet = (np.ascontiguousarray(observations.xy(role)[:, ::2, ::2]) for role in ROLES)
     sparse = replace(board, rows=dry.shape[1], columns=dry.shape[2], square=2 * board.square)

@@ -62,7 +62,7 @@ def of_poses(problem: Problem, chamber: Chamber | None, poses: Array, weight: Ar
     """What boards held at poses would say, (K, G, G), under the lenses of a problem; nothing is changed.
 
     poses: (K, 6) rt_ref_board. weight: (cameras, K, rows, columns), of each corner of a board with that spacing between
-    its corners, 0 where a camera does not see it.
+    its corners (a multiple of the problem's: every second or third corner), 0 where a camera does not see it.
     """
     found = [
         _of_batch(problem, chamber, poses[i : i + BATCH], weight[:, i : i + BATCH], spacing)
@@ -76,11 +76,13 @@ def _of_batch(problem: Problem, chamber: Chamber | None, poses: Array, weight: A
     frame, camera = np.divmod(np.arange(cameras * count), cameras)
     observations = np.zeros((cameras * count, *weight.shape[2:], 3))
     observations[..., 2] = weight[camera, frame]
+    step = round(spacing / problem.spacing)
     boards = problem.copy(
         rt_ref_board=np.array(poses, dtype=np.float64),
         observations=observations,
         indices=np.column_stack([frame, camera, camera - 1]).astype(np.int32),
         spacing=spacing,
+        lattice=None if problem.lattice is None else tuple(along[::step] for along in problem.lattice),
     )
     normal = refracted.normal_equations(boards, observations[..., :2], chamber or AIR)
     return _frames(normal, versions.layout(boards))

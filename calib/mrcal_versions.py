@@ -124,6 +124,8 @@ class Problem:
     intrinsics: (cameras, k). rt_cam_ref: (cameras - 1, 6). rt_ref_board: (frames, 6). warp: (2,) or None, mrcal's
     `calobject_warp`, metres. observations: (M, rows, columns, 3): x, y in pixels and weight, 0 or less = ignored.
     indices: (M, 3): frame, camera, camera - 1; sorted. sizes: (cameras, 2) width, height. spacing: metres.
+    lattice: where columns and rows stand, (columns,) and (rows,) metres, if not at steps of `spacing`; mrcal knows only
+    such steps, `irregular` does the rest.
     `optimize` changes all state in place and marks outliers by a negative weight.
     """
 
@@ -138,6 +140,7 @@ class Problem:
     warp: Array | None = None
     free: Free = field(default_factory=Free)
     regularization: bool = True
+    lattice: tuple[Array, Array] | None = None
 
     def copy(self, **changes: Any) -> Problem:
         """An independent copy; no array is shared. Keyword arguments replace fields."""
@@ -147,6 +150,19 @@ class Problem:
         }
         own["warp"] = None if self.warp is None else np.array(self.warp)
         return replace(self, **{**own, **changes})
+
+    def board(self, warp: Array | None = None) -> Array:
+        """Corners of the board in its own frame, (rows, columns, 3) metres, flat unless a warp is given."""
+        rows, columns = self.observations.shape[1:3]
+        if self.lattice is None:
+            return board_points(rows, columns, self.spacing, warp)
+        x, y = self.lattice
+        points = np.zeros((rows, columns, 3))
+        points[..., 0], points[..., 1] = x, y[:, None]
+        if warp is not None:
+            u, v = (2 * along / along[-1] - 1 for along in (x, y))
+            points[..., 2] = warp[0] * (1 - u**2) + warp[1] * (1 - v[:, None] ** 2)
+        return points
 
     def arguments(self, legacy: bool | None = None) -> dict[str, Any]:
         """Keyword arguments for mrcal's functions, in its names; arrays are ours, so that mrcal changes them.
@@ -201,7 +217,11 @@ class Linearization:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things stand in the state vector; an empty slice for what is not optimised."""
+    """Where things stand in the state vector; an empty slice for what is not optimised.
+
+    slab: the parameters of the panels (`slab.Slab.names` in this order), which follow mrcal's state; mrcal's own
+    functions know nothing of them. size counts them.
+    """
 
     size: int
     intrinsics: tuple[slice, ...]
@@ -209,10 +229,24 @@ class Layout:
     extrinsics: slice
     frames: slice
     warp: slice
+    slab: slice = field(default_factory=lambda: slice(0, 0))
+
+    def with_slab(self, count: int) -> Layout:
+        """The same with `count` parameters of the panels behind mrcal's state, in place of those there were."""
+        size = self.size - (self.slab.stop - self.slab.start)
+        return replace(self, size=size + count, slab=slice(size, size + count) if count else slice(0, 0))
 
 
 def optimize(problem: Problem, *, outliers: bool = False) -> None:
     """Solve in place. `outliers`: mark them (negative weights). SolveError where mrcal fails or diverges."""
+    if problem.lattice is not None:
+        if outliers:
+            raise ValueError("mrcal's own rejection of outliers is for boards with equal steps only")
+        from rainstereo.calib import irregular
+
+        irregular.optimize(problem)
+        _require_sane(problem)
+        return
     mrcal = load()
     arguments = problem.arguments()
     printed = Captured()
@@ -221,13 +255,21 @@ def optimize(problem: Problem, *, outliers: bool = False) -> None:
             mrcal.optimize(**arguments, do_apply_outlier_rejection=outliers)
     except Exception as error:  # mrcal raises bare RuntimeError and Exception
         raise SolveError(f"mrcal's optimisation failed: {error} {_tail(printed.text)}".strip()) from error
+    _require_sane(problem, printed.text)
+
+
+def _require_sane(problem: Problem, printed: str = "") -> None:
     state = [problem.intrinsics, problem.rt_cam_ref, problem.rt_ref_board]
     if not all(np.isfinite(part).all() for part in state) or not (problem.intrinsics[:, :2] > 0).all():
-        raise SolveError(f"mrcal's optimisation diverged {_tail(printed.text)}".strip())
+        raise SolveError(f"the optimisation diverged {_tail(printed)}".strip())
 
 
 def residuals(problem: Problem) -> Array:
     """Projected minus observed corners, (M, rows, columns, 2) unweighted pixels; NaN where weight <= 0."""
+    if problem.lattice is not None:
+        from rainstereo.calib import irregular
+
+        return np.where(problem.observations[..., 2:] > 0, irregular.off_by(problem), np.nan)
     with quiet():
         x = load().optimizer_callback(**problem.arguments(), no_jacobian=True, no_factorization=True)[1]
     shape = problem.observations.shape[:-1]
@@ -244,7 +286,18 @@ def linearize(problem: Problem) -> Linearization:
         scale = np.ones_like(packed)
         mrcal.unpack_state(scale, **arguments)
         boards = mrcal.num_measurements_boards(**arguments)
-    return Linearization(np.array(packed), np.array(x), jacobian, scale, int(boards))
+    at = Linearization(np.array(packed), np.array(x), jacobian, scale, int(boards))
+    if problem.lattice is None:
+        return at
+    from rainstereo.calib import irregular
+
+    off, by_state = irregular.rows(problem, layout(problem), scale)
+    rest = at.boards
+    return replace(
+        at,
+        residuals=np.concatenate([off, at.residuals[rest:]]),
+        jacobian=scipy.sparse.vstack([by_state, at.jacobian[rest:]], format="csr"),
+    )
 
 
 def ingest(problem: Problem, packed: Array) -> None:
@@ -336,8 +389,17 @@ def unproject(pixels: Array, lensmodel: str, intrinsics: Array) -> Array:
 def carried(problem: Problem, camera: int) -> dict[str, Any]:
     """What mrcal's own tools want to find in this camera's model file: the whole problem, compressed.
 
+    A board with unequal steps becomes a finer regular one, mostly unseen; if that is too fine, nothing is carried.
+
     Written in the names from before 2.5, which every release reads. Plain arrays only, no pickle.
     """
+    if problem.lattice is not None:
+        from rainstereo.calib import irregular
+
+        regular = irregular.as_regular(problem)
+        if regular is None:
+            return {}
+        problem = regular
     stream = io.BytesIO()
     inputs = {**problem.arguments(legacy=True), "do_apply_outlier_rejection": False}
     # mrcal has no None in these files; it reads an empty string as None

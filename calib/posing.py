@@ -20,8 +20,7 @@ def place(known: Problem, corners: Array, chamber: Chamber | None = None) -> tup
     chamber: what the corners were seen through, in the first camera's frame; None if that is already taken off them.
     Returns the problem of the frames that have an answer, and which those are, (F,) bool. `known` is not changed.
     """
-    rows, columns = corners.shape[2:4]
-    points = versions.board_points(rows, columns, known.spacing)
+    points = known.board()
     sizes = [(int(w), int(h)) for w, h in known.sizes]
     start = np.full((corners.shape[1], 6), np.nan)
     possible = np.isfinite(corners[..., 0]).any((0, 2, 3))
@@ -48,7 +47,7 @@ def place(known: Problem, corners: Array, chamber: Chamber | None = None) -> tup
 
 
 def _locked(known: Problem, corners: Array, sizes: list[tuple[int, int]]) -> Problem:
-    problem = adjust.assemble(corners, sizes, known.spacing)
+    problem = adjust.assemble(corners, sizes, known.spacing, known.lattice)
     return problem.copy(
         lensmodel=known.lensmodel,
         intrinsics=known.intrinsics.copy(),

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rainstereo.calib import adjust, mismatch, outliers, through_acrylic
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.adjust import Dropped
+from rainstereo.calib.joint import Estimate
 from rainstereo.calib.mrcal_versions import Problem, SolveError
 from rainstereo.calib.observations import Observations
+from rainstereo.calib.refracted import Panels
+from rainstereo.calib.sought import Sought, find
 from rainstereo.calib.through_acrylic import Passes
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
@@ -36,6 +39,8 @@ class Solution:
     dropped: frames that were left out and why. reordered: frames in which the wet camera's corners came reversed.
     passes: how the solution through the chamber went, None without one.
     problem: what mrcal solved; with a chamber its corners are those that bare cameras would have seen.
+    panels: what stood between cameras and boards, as it came out. estimate: what was found out about it, None where it
+    was taken as described. moved: frames that were said to show a board that stood still, and do not.
     """
 
     rig: Rig
@@ -53,6 +58,9 @@ class Solution:
     passes: Passes | None
     solve_seconds: float
     problem: Problem
+    panels: Panels | None = None
+    estimate: Estimate | None = None
+    moved: tuple[str, ...] = field(default=())
 
     @property
     def outlier_count(self) -> int:
@@ -65,12 +73,14 @@ class Solution:
         return int(sum(np.isfinite(r[..., 0]).sum() for r in self.residuals.values()))
 
 
-def solve(observations: Observations, lensmodel: str, chamber: Chamber | None = None, *, warp: bool = True) -> Solution:
-    """Calibrate both cameras, their relative pose and all board poses at once.
+def solve(
+    observations: Observations, lensmodel: str, chamber: Chamber | Sought | None = None, *, warp: bool = True
+) -> Solution:
+    """Calibrate both cameras, their relative pose and all board poses at once, and of the panels what is sought.
 
     lensmodel: mrcal's name ("LENSMODEL_OPENCV8", ...), or "splined" for a splined model that suits the field of view.
-    chamber: the panels that both cameras look through, in the dry camera's frame; taken as exact. warp: let the
-    board be bent (mrcal's two parameters).
+    chamber: the panels that both cameras look through, in the dry camera's frame, taken as described; or what is to be
+    found out about them, and from which frames. warp: let the board be bent (mrcal's two parameters).
 
     Frames seen by one camera only take part. Frames that contradict the others are dropped and named. SolveError or
     ValueError where nothing useful can be found; whether the result deserves trust is for `checks` to say.
@@ -90,18 +100,27 @@ def solve(observations: Observations, lensmodel: str, chamber: Chamber | None = 
     if warp:
         adjust.bend(adjustment.problem)
     passes = settle(adjustment, chamber)
-    return package(adjustment, observations, chamber, passes, time.perf_counter() - started)
+    if not isinstance(chamber, Sought):
+        return package(adjustment, observations, chamber, passes, time.perf_counter() - started)
+    if not chamber.free:
+        panels = chamber.panels(adjustment.frames)
+        solved = package(adjustment, observations, chamber.chamber, passes, time.perf_counter() - started, panels)
+        return replace(solved, panels=panels)
+    panels, estimate, moved = find(adjustment, chamber, adjust.fit(adjustment.problem))
+    solved = package(adjustment, observations, estimate.chamber, passes, time.perf_counter() - started, panels)
+    return replace(solved, panels=panels, estimate=estimate, moved=moved)
 
 
-def settle(adjustment: adjust.Adjustment, chamber: Chamber | None) -> Passes | None:
-    """Solve and reject outliers, through the chamber if there is one, until no corner changes sides."""
+def settle(adjustment: adjust.Adjustment, chamber: Chamber | Sought | None) -> Passes | None:
+    """Solve and reject outliers, through the panels as described if there are any, until no corner changes sides."""
     passes: list[Passes] = []
 
     def solver(trial: adjust.Adjustment) -> None:
         if chamber is None:
             versions.optimize(trial.problem)
         else:
-            passes.append(through_acrylic.refine(trial.problem, trial.seen(), chamber))
+            panels = chamber.panels(trial.frames) if isinstance(chamber, Sought) else chamber
+            passes.append(through_acrylic.refine(trial.problem, trial.seen(), panels))
 
     outliers.reject(adjustment, solver)
     adjust.unregularize(adjustment, solver)
@@ -114,8 +133,9 @@ def package(
     chamber: Chamber | None,
     passes: Passes | None,
     seconds: float,
+    panels: Panels | None = None,
 ) -> Solution:
-    """The solution that an adjusted problem stands for."""
+    """The solution that an adjusted problem stands for. panels: where not all frames were seen through the chamber."""
     problem = adjustment.problem
     cameras = [
         Camera(
@@ -147,7 +167,7 @@ def package(
         outliers=rejected,
         rms_px=rms(off),
         rms_by_role={role: rms(r) for role, r in residuals.items()},
-        dropped=mismatch.explain(adjustment, chamber),
+        dropped=mismatch.explain(adjustment, chamber if panels is None or panels.frames is None else None),
         reordered=adjustment.reordered,
         passes=passes,
         solve_seconds=seconds,

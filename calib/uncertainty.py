@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import scipy.linalg
 import scipy.stats
 
 from rainstereo import pose
@@ -25,29 +24,21 @@ from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.mrcal_versions import Layout, Problem
 from rainstereo.calib.rotation import cross_matrix, rotated_by
 from rainstereo.calib.solve import Solution
+from rainstereo.calib.state_covariance import Covariance, regular_inverse
 from rainstereo.rig import ROLES, Rig, Role
 from rainstereo.types import Array, Mask
+
+__all__ = [
+    "GRID", "Covariance", "Difference", "Gauge", "InfinityError", "UncertaintyMap", "baseline_sigma", "covariance",
+    "image_grid", "infinity_error", "infinity_uncertainty", "problem_of", "regular_inverse",
+    "stereo_infinity_uncertainty",
+]  # fmt: skip
 
 GRID = (24, 18)
 MARGIN = 0.02
 """Grids keep this fraction of the image away from its border."""
-RECIPROCAL_CONDITION = 1e-14
 
 Gauge = Literal["boards", "image"]
-
-
-@dataclass(frozen=True, eq=False)
-class Covariance:
-    """Covariance of everything a solution estimated, (S, S) in SI units and pixels, as `layout` lays it out.
-
-    sigma: standard deviation of a corner's coordinate, pixels, from residuals and degrees of freedom.
-    condition: of the scaled normal equations; beyond 1e14 something is not determined by the data at all.
-    """
-
-    matrix: Array
-    layout: Layout
-    sigma: float
-    condition: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +58,11 @@ class UncertaintyMap:
         """Standard deviation in the worst direction, (rows, columns) pixels."""
         a, b, c = self.covariance[..., 0, 0], self.covariance[..., 1, 1], self.covariance[..., 0, 1]
         return np.asarray(np.sqrt((a + b) / 2 + np.hypot((a - b) / 2, c)))
+
+    @property
+    def variance(self) -> Array:
+        """Expected squared length of the error, (rows, columns) square pixels."""
+        return np.asarray(np.trace(self.covariance, axis1=-2, axis2=-1))
 
     @property
     def typical(self) -> float:
@@ -96,13 +92,18 @@ class UncertaintyMap:
 
 
 def covariance(solution: Solution | Problem) -> Covariance:
-    """Covariance of the solution's state, from its residuals and mrcal's Jacobian."""
-    problem = _problem(solution)
+    """Covariance of the solution's state, from its residuals and mrcal's Jacobian.
+
+    Where panels were estimated it is that of the joint solve, with their parameters.
+    """
+    if not isinstance(solution, Problem) and solution.estimate is not None:
+        return solution.estimate.covariance
+    problem = problem_of(solution)
     linear = versions.linearize(problem)
     rows = linear.jacobian[: linear.boards]
     normal = (linear.jacobian.T @ linear.jacobian).toarray()
     corners = (rows.T @ rows).toarray()
-    inverse, condition = _inverse(normal)
+    inverse, condition = regular_inverse(normal)
     packed = inverse @ corners @ inverse
     inliers = int(2 * (problem.observations[..., 2] > 0).sum())
     freedom = inliers - float(np.sum(inverse * corners))  # the trace of the hat matrix: parameters really spent
@@ -112,27 +113,16 @@ def covariance(solution: Solution | Problem) -> Covariance:
     return Covariance((matrix + matrix.T) / 2, versions.layout(problem), sigma, condition)
 
 
-def _problem(solution: Solution | Problem) -> Problem:
+def problem_of(solution: Solution | Problem) -> Problem:
+    """What mrcal solved, from a solution or given as it is."""
     return solution if isinstance(solution, Problem) else solution.problem
-
-
-def _inverse(normal: Array) -> tuple[Array, float]:
-    """Inverse of a symmetric positive matrix and its condition after scaling its diagonal to one.
-
-    Directions that are not determined get a large finite variance, so that what does not depend on them stays known.
-    """
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    w, U = scipy.linalg.eigh(normal * np.outer(scale, scale), driver="evd", check_finite=False)
-    condition = float(w[-1] / max(w[0], w[-1] * 1e-17))
-    w = np.maximum(w, w[-1] * RECIPROCAL_CONDITION)
-    return (U / w) @ U.T * np.outer(scale, scale), condition
 
 
 def baseline_sigma(solution: Solution | Problem, cov: Covariance | None = None) -> float:
     """Standard deviation of the baseline, metres; the board's squares are taken as exact."""
     cov = covariance(solution) if cov is None else cov
     span = slice(cov.layout.extrinsics.start + 3, cov.layout.extrinsics.start + 6)
-    t = _problem(solution).rt_cam_ref[0, 3:]
+    t = problem_of(solution).rt_cam_ref[0, 3:]
     return float(np.sqrt(t @ cov.matrix[span, span] @ t) / np.linalg.norm(t))
 
 
@@ -149,7 +139,7 @@ def infinity_uncertainty(
     gauge: "boards" as mrcal has it, "image" for what is left after the best-fitting rotation.
     """
     cov = covariance(solution) if cov is None else cov
-    problem, index = _problem(solution), ROLES.index(role)
+    problem, index = problem_of(solution), ROLES.index(role)
     pixels = image_grid(problem.sizes[index], grid)
     lens = problem.lensmodel, problem.intrinsics[index]
     rays, seen = _rays(pixels, *lens)
@@ -159,8 +149,8 @@ def infinity_uncertainty(
     if gauge == "boards":
         _through_boards(F, rays, by_ray, problem, index, cov.layout)
     else:
-        F += by_ray @ _best_rotation(rays, by_ray, F)
-    return _map(pixels, F, seen, cov)
+        F += by_ray @ best_rotation(rays, by_ray, F)
+    return to_map(pixels, F, seen, cov)
 
 
 def stereo_infinity_uncertainty(
@@ -171,7 +161,7 @@ def stereo_infinity_uncertainty(
     On a grid of (columns, rows) dry pixels. This is the error that stays in aligned pairs of far scenes.
     """
     cov = covariance(solution) if cov is None else cov
-    problem, layout = _problem(solution), cov.layout
+    problem, layout = problem_of(solution), cov.layout
     pixels = image_grid(problem.sizes[0], grid)
     rays, seen = _rays(pixels, problem.lensmodel, problem.intrinsics[0])
     _, by_ray, by_lens = versions.project_gradients(rays, problem.lensmodel, problem.intrinsics[0])
@@ -184,7 +174,7 @@ def stereo_infinity_uncertainty(
     ]
     F[..., layout.intrinsics[1]] = wet_by_lens[..., layout.intrinsics_columns]
     F[..., _rotation(layout.extrinsics, 0)] = wet_by_ray @ rotated_by(r, rays)
-    return _map(pixels, F, seen, cov)
+    return to_map(pixels, F, seen, cov)
 
 
 @dataclass(frozen=True)
@@ -248,7 +238,7 @@ def _through_boards(F: Array, rays: Array, by_ray: Array, problem: Problem, inde
         F[..., _rotation(layout.frames, frame)] = by_ray @ R @ moved / len(boards)
 
 
-def _best_rotation(rays: Array, by_ray: Array, F: Array) -> Array:
+def best_rotation(rays: Array, by_ray: Array, F: Array) -> Array:
     """How the rays move, (N, 3, S), under the rotation that best undoes what F does to the image."""
     moved = -_tangent_inverse(by_ray) @ F
     K = cross_matrix(rays)  # w x v = -[v]x w: the least-squares w of sum |dv - w x v|^2
@@ -270,7 +260,8 @@ def _rays(pixels: Array, lensmodel: str, intrinsics: Array) -> tuple[Array, Mask
     return rays[seen], seen
 
 
-def _map(pixels: Array, F: Array, seen: Mask, cov: Covariance) -> UncertaintyMap:
+def to_map(pixels: Array, F: Array, seen: Mask, cov: Covariance) -> UncertaintyMap:
+    """The map of a prediction with the derivative F, (M, 2, S), at those M of the grid's pixels that are `seen`."""
     moved = F @ cov.matrix
     flat, moved_flat = F.reshape(-1, cov.layout.size), moved.reshape(-1, cov.layout.size)
     mixed = moved_flat.T @ flat / max(len(F), 1)  # C FtF / N: the trace of its square is that of (F C Ft)^2 / N^2

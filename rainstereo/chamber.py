@@ -11,7 +11,7 @@ import math
 import os
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,21 @@ from .types import Array
 
 INDEX_RANGE = (1.0, 4.5)
 THICKNESS_RANGE = (0.0, 1.0)
-EXAMPLE = """a chamber.toml looks like this:
+THICKNESS_SD, TILT_SD, INDEX_SD = 2e-5, math.radians(0.5), 0.002
+"""Standard deviations where a chamber.toml gives some but not this one: a caliper's 0.02 mm; half a degree of a tilt
+measured with a protractor; 0.002 of an index from a data sheet (acrylic is sold with 1.489 to 1.492)."""
+SD_LIMITS = {"thickness": (0.01, " m"), "tilt": (math.radians(45), " rad"), "index": (0.5, "")}
+NOMINAL = ("distance", "gaps", "thickness", "tilt", "index")
+EXAMPLE = """a chamber.toml looks like this (what ends in _sd_... are standard deviations and may be left out):
   normal = [0.0, 0.2588, 0.9659]   # from the cameras to the scene, in the frame of the dry camera
   distance_mm = 40.0               # along the normal, from the dry camera to the first face
   gaps_mm = [20.0]                 # air between the panels
+  tilt_sd_deg = 0.5
   [[panel]]
   thickness_mm = 4.0
   index = 1.49
+  thickness_sd_mm = 0.02
+  index_sd = 0.002
   [[panel]]
   thickness_mm = 4.0
   index = 1.49"""
@@ -56,6 +64,41 @@ class Panel:
 
 
 @dataclass(frozen=True)
+class ChamberUncertainty:
+    """Standard deviations of a chamber's description; 0 = taken as exact.
+
+    thickness, index: one for each panel, metres and unitless. tilt: radians, of the normal about either axis across it.
+    """
+
+    thickness: tuple[float, ...]
+    tilt: float
+    index: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        values = {"thickness": tuple(self.thickness), "tilt": (self.tilt,), "index": tuple(self.index)}
+        for name, given in values.items():
+            limit, unit = SD_LIMITS[name]
+            for value in given:
+                if not 0 <= value <= limit:
+                    raise ValueError(
+                        f"a standard deviation of the {name} of {value:g}{unit} was given; expected 0 to "
+                        f"{limit:.3g}{unit} (chamber.toml has thickness_sd_mm, tilt_sd_deg and index_sd; a caliper "
+                        "knows 0.02 mm)"
+                    )
+        object.__setattr__(self, "thickness", values["thickness"])
+        object.__setattr__(self, "index", values["index"])
+
+    @classmethod
+    def default(cls, panels: Sequence[Panel]) -> ChamberUncertainty:
+        """What a caliper, a protractor and a data sheet leave open; a medium without end has no thickness to err in."""
+        return cls(
+            tuple(0.0 if panel.thickness == math.inf else THICKNESS_SD for panel in panels),
+            TILT_SD,
+            (INDEX_SD,) * len(panels),
+        )
+
+
+@dataclass(frozen=True)
 class Chamber:
     """Parallel panels as one camera sees them. Lengths in metres, `normal` in that camera's frame.
 
@@ -63,12 +106,16 @@ class Chamber:
     distance: along the normal, from the camera's centre to the first face; positive.
     panels: in the order in which light from the camera meets them.
     gaps: air between consecutive panels; one fewer than panels.
+    uncertainty: standard deviations of tilt, thickness and index; None: not stated.
+    nominal: which of `NOMINAL` a calibration could not measure and took over from a description.
     """
 
     normal: tuple[float, float, float]
     distance: float
     panels: tuple[Panel, ...]
     gaps: tuple[float, ...] = field(default=())
+    uncertainty: ChamberUncertainty | None = None
+    nominal: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = np.asarray(self.normal, dtype=np.float64)
@@ -87,11 +134,20 @@ class Chamber:
             raise ValueError(f"gaps {gaps} were given; expected metres, 0 or more")
         if any(panel.thickness == math.inf for panel in panels[:-1]):
             raise ValueError("only the last panel can be infinitely thick")
+        sd = self.uncertainty
+        if sd is not None and not len(sd.thickness) == len(sd.index) == len(panels):
+            raise ValueError(
+                f"standard deviations of {len(sd.thickness)} thicknesses and {len(sd.index)} indices were given for "
+                f"{len(panels)} panels; expected one of each for each panel"
+            )
+        if unknown := sorted(set(self.nominal) - set(NOMINAL)):
+            raise ValueError(f"nominal names {', '.join(unknown)}; expected some of {', '.join(NOMINAL)}")
         nx, ny, nz = (n / length).tolist()
         object.__setattr__(self, "normal", (nx, ny, nz))
         object.__setattr__(self, "distance", float(self.distance))
         object.__setattr__(self, "panels", panels)
         object.__setattr__(self, "gaps", gaps)
+        object.__setattr__(self, "nominal", tuple(self.nominal))
 
     @cached_property
     def faces(self) -> Array:
@@ -114,7 +170,14 @@ class Chamber:
     def transformed(self, rt_a_b: Array) -> Chamber:
         """The chamber, given in frame b, in the coordinates of frame a (another camera's)."""
         n = rotation_matrix(np.asarray(rt_a_b)[:3]) @ np.asarray(self.normal)
-        return Chamber(tuple(n.tolist()), self.distance + float(n @ np.asarray(rt_a_b)[3:]), self.panels, self.gaps)
+        distance = self.distance + float(n @ np.asarray(rt_a_b)[3:])
+        return replace(self, normal=tuple(n.tolist()), distance=distance)
+
+    def with_uncertainty(self) -> Chamber:
+        """The chamber with standard deviations: its own, or where it states none those of `ChamberUncertainty`."""
+        if self.uncertainty is not None:
+            return self
+        return replace(self, uncertainty=ChamberUncertainty.default(self.panels))
 
     # -- chamber.toml ----------------------------------------------------------------------------------------------
 
@@ -134,14 +197,17 @@ class Chamber:
 
     @classmethod
     def _from_table(cls, table: dict[str, Any]) -> Chamber:
-        _only(table, ("normal", "distance_mm", "gaps_mm", "panel"), "chamber.toml")
+        _only(table, ("normal", "distance_mm", "gaps_mm", "tilt_sd_deg", "nominal", "panel"), "chamber.toml")
         for panel in table["panel"]:
-            _only(panel, ("thickness_mm", "index"), "a [[panel]]")
+            _only(panel, ("thickness_mm", "index", "thickness_sd_mm", "index_sd"), "a [[panel]]")
+        panels = tuple(Panel(panel["thickness_mm"] / 1000, panel["index"]) for panel in table["panel"])
         return cls(
             tuple(table["normal"]),
             table["distance_mm"] / 1000,
-            tuple(Panel(panel["thickness_mm"] / 1000, panel["index"]) for panel in table["panel"]),
+            panels,
             tuple(gap / 1000 for gap in table.get("gaps_mm", [])),
+            _uncertainty(table, panels),
+            tuple(table.get("nominal", [])),
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -152,14 +218,37 @@ class Chamber:
             f"distance_mm = {self.distance * 1000!r}   # along the normal, from the dry camera to the first face",
             f"gaps_mm = [{', '.join(repr(gap * 1000) for gap in self.gaps)}]   # air between the panels",
         ]
-        for panel in self.panels:
+        sd = self.uncertainty
+        if self.nominal:
+            lines.append(
+                f"nominal = {list(self.nominal)!r}   # taken from a description, not measured".replace("'", '"')
+            )
+        if sd is not None:
+            lines.append(f"tilt_sd_deg = {math.degrees(sd.tilt)!r}   # standard deviation, as all that ends in _sd")
+        for i, panel in enumerate(self.panels):
             lines += [
                 "",
                 "[[panel]]",
                 f"thickness_mm = {panel.thickness * 1000!r}",
                 f"index = {panel.index!r}",
             ]
+            if sd is not None:
+                lines += [f"thickness_sd_mm = {sd.thickness[i] * 1000!r}", f"index_sd = {sd.index[i]!r}"]
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _uncertainty(table: dict[str, Any], panels: Sequence[Panel]) -> ChamberUncertainty | None:
+    """What the file says of standard deviations, the defaults where it says some; None where it says none."""
+    keys = ("thickness_sd_mm", "index_sd")
+    if "tilt_sd_deg" not in table and not any(key in panel for panel in table["panel"] for key in keys):
+        return None
+    usual = ChamberUncertainty.default(panels)
+    given = list(zip(table["panel"], usual.thickness, usual.index, strict=True))
+    return ChamberUncertainty(
+        tuple(panel["thickness_sd_mm"] / 1000 if "thickness_sd_mm" in panel else sd for panel, sd, _ in given),
+        math.radians(table.get("tilt_sd_deg", math.degrees(usual.tilt))),
+        tuple(panel.get("index_sd", sd) for panel, _, sd in given),
+    )
 
 
 def _only(table: dict[str, Any], known: Sequence[str], where: str) -> None:

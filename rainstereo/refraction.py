@@ -292,11 +292,35 @@ def jacobian(points: Array, camera: Camera, chamber: Chamber) -> Jacobian:
     )
 
 
-def apparent_jacobian(points: Array, chamber: Chamber) -> tuple[Array, Array, types.Status]:
-    """`apparent` of points, (N, 3), its derivative with respect to the point, (N, 3, 3), and status, (N,)."""
+@dataclass(frozen=True, eq=False)
+class ApparentGradients:
+    """`apparent` of N points with its derivatives; NaN where a point is not seen. P = number of panels.
+
+    seen: (N, 3), status: (N,). point: (N, 3, 3). normal: (N, 3, 3), of the direction normal/|normal|, a radian.
+    thickness: (N, 3, P). index: (N, 3, P) metres.
+    """
+
+    seen: Array
+    status: types.Status
+    point: Array
+    normal: Array
+    thickness: Array
+    index: Array
+
+
+def apparent_gradients(points: Array, chamber: Chamber) -> ApparentGradients:
+    """Where a camera at the origin seems to see points, (N, 3), and how that moves with points and panels."""
     bend = _bend(points, chamber)
     normal = np.asarray(chamber.normal)
-    return bend.seen, np.eye(3) - normal[:, None] * bend.by_point[:, None, :], bend.status
+    along = normal[:, None]
+    return ApparentGradients(
+        bend.seen,
+        bend.status,
+        point=np.eye(3) - along * bend.by_point[:, None, :],
+        normal=-bend.delta[:, None, None] * (np.eye(3) - np.outer(normal, normal)) - along * bend.by_normal[:, None, :],
+        thickness=-along * bend.by_thickness[:, None, :],
+        index=-along * bend.by_index[:, None, :],
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rainstereo import Camera, Chamber, Panel
-from rainstereo.refraction import Status, apparent, apparent_jacobian, backproject, jacobian, project
+from rainstereo.refraction import Status, apparent, apparent_gradients, backproject, jacobian, project
 
 from .snell_reference import see
 
@@ -363,13 +363,16 @@ def test_apparent_point_is_what_any_camera_projects(rng: np.random.Generator) ->
 def test_derivative_of_the_apparent_point(rng: np.random.Generator) -> None:
     """Against the pixel's: through any camera the chain rule gives `jacobian`; without panels it is the identity."""
     P, ch = scene(rng, 40, 0.041, 5), chamber(30, panels=(Panel(0.004, 1.49), Panel(math.inf, 1.333)))
-    seen, by_point, status = apparent_jacobian(P, ch)
+    gradients = apparent_gradients(P, ch)
+    seen, by_point = gradients.seen, gradients.point
     np.testing.assert_array_equal(seen, apparent(P, ch)[0])
-    assert (status == 0).all()
+    assert (gradients.status == 0).all()
     _, J = CAMERA.project_jacobian(seen)
-    np.testing.assert_allclose(J @ by_point, jacobian(P, CAMERA, ch).point, rtol=1e-12, atol=1e-9)
+    pixel = jacobian(P, CAMERA, ch)
+    for name in ("point", "normal", "thickness", "index"):
+        np.testing.assert_allclose(J @ getattr(gradients, name), getattr(pixel, name), rtol=1e-12, atol=1e-9)
     steps = 1e-6 * np.eye(3)
     numeric = np.stack([(apparent(P + h, ch)[0] - apparent(P - h, ch)[0]) / 2e-6 for h in steps], -1)
     np.testing.assert_allclose(by_point, numeric, atol=1e-8)
-    bare = apparent_jacobian(P, chamber(30, panels=(), gaps=()))[1]
+    bare = apparent_gradients(P, chamber(30, panels=(), gaps=())).point
     np.testing.assert_array_equal(bare, np.broadcast_to(np.eye(3), bare.shape))
