@@ -56,7 +56,7 @@ def test_paired_captures_of_rendered_boards(tmp_path: Path) -> None:
     assert abs(off[1]) < 4 * 1.5 * sigmas["yaw"]
     thickness = [sum(panel.thickness for panel in chamber.panels) for chamber in (found, true)]
     assert abs(thickness[0] - thickness[1]) < 4 * 1.5 * sigmas["thickness 0"]
-    assert [row["name"] for row in told["panels"]["hypotheses"]][0] == "no slab"
+    assert told["panels"]["hypotheses"][0]["name"] == "no slab"
     page = (out / "report.html").read_text()
     assert "sigma after / before" in page
     assert "panels not parallel" in page
