@@ -72,8 +72,8 @@ def slab_section(report: Report, solution: Solution, findings: Findings) -> None
         strong=[i for i, row in enumerate(findings.hypotheses) if row.rejects],
     )
     report.text(
-        "Each is solved to its own best on the same corners, without any prior. The RMS hardly tells them apart; "
-        "chi-squared does. The probability is that of so large a gain by chance, were the poorer hypothesis true."
+        "Each is solved to its own best on the same corners, without any prior. Where all boards are behind the "
+        "chamber the RMS hardly tells them apart; chi-squared does. The probability is that of so large a gain by chance, were the poorer hypothesis true."
     )
 
 
@@ -88,6 +88,6 @@ def _row(row: Hypothesis) -> tuple[str | int, ...]:
         f"{row.chi2:.0f}",
         f"{row.rms_px:.5f}",
         gain,
-        "-" if row.against is None else f"{row.p:.2g}",
+        "-" if row.against is None else "< 1e-12" if row.p < 1e-12 else f"{row.p:.2g}",
         verdict,
     )
