@@ -75,7 +75,8 @@ def slab_section(report: Report, solution: Solution, findings: Findings) -> None
     )
     report.text(
         "Each is solved to its own best on the same corners, without any prior. Where all boards are behind the "
-        "chamber the RMS hardly tells them apart; chi-squared does. The probability is that of so large a gain by chance, were the poorer hypothesis true."
+        "chamber the RMS hardly tells them apart; chi-squared does. The probability is that of so large a gain by "
+        "chance, were the poorer hypothesis true."
     )
 
 
