@@ -24,6 +24,7 @@ STAGES: dict[str, str] = {
     "warp": "rainstereo.apps.bench_warp",
     "calibration": "rainstereo.apps.bench_calibration",
     "guidance": "rainstereo.apps.bench_guidance",
+    "slab": "rainstereo.apps.bench_slab",
     "drops": "rainstereo.apps.bench_drops",
     "rain": "rainstereo.apps.bench_rain",
     "align": "rainstereo.apps.bench_align",
@@ -44,8 +45,8 @@ class Options:
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What to measure: refraction, warp, calibration, guidance, drops, rain, align, record, select, train, derain, or
-    all."""
+    """What to measure: refraction, warp, calibration, guidance, slab, drops, rain, align, record, select, train, derain,
+    or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15

@@ -18,7 +18,7 @@ from rainstereo.calib import contributions, point_uncertainty, uncertainty
 from rainstereo.calib.board import Board
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.prior import Prior
-from rainstereo.calib.slab import Kind, across
+from rainstereo.calib.slab import across
 from rainstereo.calib.solve import Solution, solve
 from rainstereo.calib.sought import Sought
 from rainstereo.chamber import ChamberUncertainty
@@ -31,6 +31,7 @@ NOISE_PX = 0.1
 MODEL = "LENSMODEL_OPENCV8"
 SD = ChamberUncertainty((2e-5, 2e-5), np.deg2rad(0.5), (0.002, 0.002))
 DEPTH_M = 2.0
+MODES = ("known", "estimated", "exact", "ignored", "paired")
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,28 +76,55 @@ class Outcomes:
         return float(np.sqrt(np.mean((self.errors[name] / self.sigmas[name]) ** 2)))
 
 
-def study(setting: Setting, runs: int, seed: int, progress: object = None) -> Outcomes:
-    """Calibrate `runs` captures."""
-    truth = digital_rig(RigOptions(tilt_deg=setting.tilt_deg), seed)
-    poses = board_poses(truth, BOARD, setting.frames, seed, near=setting.near, far=setting.far)
-    exact = exact_observations(truth, BOARD, poses)
-    if setting.mode == "paired":
-        bare = exact_observations(truth, BOARD, poses, through=False)
-        exact = (np.concatenate([bare[0], exact[0]]), np.concatenate([bare[1], exact[1]]))
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A setting with its rig and where the corners are without noise: dry and wet, (N, rows, columns, 2)."""
+
+    setting: Setting
+    truth: Rig
+    exact: tuple[Array, Array]
+
+    @classmethod
+    def of(cls, setting: Setting, seed: int) -> Capture:
+        """The capture that a seed stands for. ValueError for an unknown mode."""
+        if setting.mode not in MODES:
+            raise ValueError(f"mode {setting.mode!r} was given; expected one of {', '.join(MODES)}")
+        truth = digital_rig(RigOptions(tilt_deg=setting.tilt_deg), seed)
+        poses = board_poses(truth, BOARD, setting.frames, seed, near=setting.near, far=setting.far)
+        exact = exact_observations(truth, BOARD, poses)
+        if setting.mode == "paired":
+            bare = exact_observations(truth, BOARD, poses, through=False)
+            exact = (np.concatenate([bare[0], exact[0]]), np.concatenate([bare[1], exact[1]]))
+        return cls(setting, truth, exact)
+
+    def calibrated(self, rng: np.random.Generator) -> Solution:
+        """One draw of the noise, calibrated."""
+        dry, wet = (corners + rng.normal(0, NOISE_PX, corners.shape) for corners in self.exact)
+        names = tuple(f"{i:03d}" for i in range(len(dry)))
+        sizes: dict[str, tuple[int, int]] = {role: self.truth.camera(role).size for role in ROLES}
+        return solve(Observations(BOARD, names, dry, wet, sizes), MODEL, self._sought(rng))
+
+    def _sought(self, rng: np.random.Generator) -> Chamber | Sought | None:
+        chamber, mode, count = self.truth.chamber, self.setting.mode, self.setting.frames
+        if chamber is None or mode == "ignored":
+            return None
+        if mode == "exact":
+            return chamber
+        if mode == "paired":
+            rough = replace(described(chamber, rng, 4.0), panels=tuple(Panel(0.0038, p.index) for p in chamber.panels))
+            through, ties = np.arange(2 * count) >= count, np.arange(2 * count) % count
+            return Sought(rough, ("tilt", "thickness"), None, through, ties, wedge=True)
+        known = described(chamber, rng)
+        return known if mode == "known" else Sought(known, ("tilt", "thickness", "index"), Prior(known))
+
+
+def outcomes(capture: Capture, runs: int, seed: int) -> Outcomes:
+    """Calibrate `runs` draws of a capture."""
     rows: list[tuple[dict[str, tuple[float, float]], float, float, int]] = []
     for run in range(runs):
-        rng = np.random.default_rng([seed, run, 0x51AB])
-        solution = calibrated(setting, truth, exact, rng)
-        rows.append(
-            (
-                quantities(solution, truth),
-                infinity_error(solution.rig, truth),
-                solution.solve_seconds,
-                _wedged(solution),
-            )
-        )
-        if callable(progress):
-            progress(run + 1, runs)
+        solution = capture.calibrated(np.random.default_rng([seed, run, 0x51AB]))
+        told, far = quantities(solution, capture.truth), infinity_error(solution.rig, capture.truth)
+        rows.append((told, far, solution.solve_seconds, _wedged(solution)))
     names = list(rows[0][0])
     return Outcomes(
         {name: np.array([row[0][name][0] for row in rows]) for name in names},
@@ -105,34 +133,6 @@ def study(setting: Setting, runs: int, seed: int, progress: object = None) -> Ou
         np.array([row[2] for row in rows]),
         sum(row[3] for row in rows),
     )
-
-
-def calibrated(setting: Setting, truth: Rig, exact: tuple[Array, Array], rng: np.random.Generator) -> Solution:
-    """One capture with its noise, calibrated."""
-    dry, wet = (corners + rng.normal(0, NOISE_PX, corners.shape) for corners in exact)
-    names = tuple(f"{i:03d}" for i in range(len(dry)))
-    sizes = {role: truth.camera(role).size for role in ROLES}
-    observations = Observations(BOARD, names, dry, wet, dict(sizes))
-    chamber = truth.chamber
-    if chamber is None:
-        raise ValueError("the study needs a chamber")
-    sought: Chamber | Sought | None
-    if setting.mode == "ignored":
-        sought = None
-    elif setting.mode == "exact":
-        sought = chamber
-    elif setting.mode == "known":
-        sought = described(chamber, rng)
-    elif setting.mode == "estimated":
-        known = described(chamber, rng)
-        sought = Sought(known, ("tilt", "thickness", "index"), Prior(known))
-    else:
-        count = setting.frames
-        rough = replace(described(chamber, rng, 4.0), panels=tuple(Panel(0.0038, p.index) for p in chamber.panels))
-        through, ties = np.arange(2 * count) >= count, np.arange(2 * count) % count
-        free: tuple[Kind, ...] = ("tilt", "thickness")
-        sought = Sought(rough, free, None, through, ties, wedge=True)
-    return solve(observations, MODEL, sought)
 
 
 def described(chamber: Chamber, rng: np.random.Generator, times: float = 1.0) -> Chamber:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rainstereo import Camera, Chamber, Panel, Rig
+from rainstereo.chamber import INDEX_SD, THICKNESS_SD, TILT_SD, ChamberUncertainty
 from rainstereo.pose import compose, invert, rotation_matrix, rotation_vector, transform
 from rainstereo.refraction import project
 
@@ -79,6 +80,16 @@ def test_chamber_file_round_trip(tmp_path: Path) -> None:
         ("normal=[0,0,1]\ndistance_mm=-40\npanel=[{thickness_mm=4, index=1.49}]", "first face is -0.04 m"),
         ("normal=[0,0,0]\ndistance_mm=40\npanel=[{thickness_mm=4, index=1.49}]", "is no direction"),
         ("normal=[0,0,1]\ndistance_mm=40\ngaps_mm=[3]\npanel=[{thickness_mm=4, index=1.49}]", "have 0 gaps"),
+        (
+            "normal=[0,0,1]\ndistance_mm=40\ntilt_sd_deg=-1\npanel=[{thickness_mm=4, index=1.49}]",
+            "deviation of the tilt",
+        ),
+        (
+            "normal=[0,0,1]\ndistance_mm=40\npanel=[{thickness_mm=4, index=1.49, thickness_sd_mm=20}]",
+            "deviation of the thickness of 0.02 m was given",
+        ),
+        ("normal=[0,0,1]\ndistance_mm=40\npanel=[{thickness_mm=4, index=1.49, index_sd=2}]", "deviation of the index"),
+        ("normal=[0,0,1]\ndistance_mm=40\nnominal=['x']\npanel=[{thickness_mm=4, index=1.49}]", "nominal names x"),
         ("normal=[0,0,1]\ndistance=40\npanel=[{thickness_mm=4, index=1.49}]", "has distance, which means nothing"),
     ],
 )
@@ -89,6 +100,29 @@ def test_a_bad_chamber_file_is_explained_with_an_example(tmp_path: Path, text: s
         Chamber.load(path)
     assert str(path) in str(raised.value)
     assert "thickness_mm = 4.0" in str(raised.value)
+
+
+def test_standard_deviations_and_what_was_not_measured_are_kept(tmp_path: Path) -> None:
+    sd = ChamberUncertainty((2e-5, 5e-5), math.radians(0.3), (0.001, 0.0))
+    before = Chamber((0, 0.3, 1.0), 0.04, PANELS, (0.02,), sd, ("distance", "gaps"))
+    before.save(tmp_path / "chamber.toml")
+    after = Chamber.load(tmp_path / "chamber.toml")
+    assert after.uncertainty is not None
+    assert after.uncertainty.thickness == pytest.approx(sd.thickness, rel=1e-12)
+    assert after.uncertainty.tilt == pytest.approx(sd.tilt, rel=1e-12)
+    assert after.uncertainty.index == sd.index
+    assert after.nominal == ("distance", "gaps")
+    assert after.transformed(POSE).uncertainty == after.uncertainty
+    assert CHAMBER.uncertainty is None  # not stated, rather than exact
+    usual = CHAMBER.with_uncertainty().uncertainty
+    assert usual == ChamberUncertainty((THICKNESS_SD,) * 2, TILT_SD, (INDEX_SD,) * 2)
+    assert before.with_uncertainty() is before
+
+
+def test_a_file_that_states_some_standard_deviations_gets_the_usual_others(tmp_path: Path) -> None:
+    path = tmp_path / "chamber.toml"
+    path.write_text("normal=[0,0,1]\ndistance_mm=40\npanel=[{thickness_mm=4, index=1.49, thickness_sd_mm=0.1}]")
+    assert Chamber.load(path).uncertainty == ChamberUncertainty((1e-4,), TILT_SD, (INDEX_SD,))
 
 
 def test_only_the_last_panel_may_be_endless() -> None:
