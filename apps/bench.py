@@ -45,8 +45,8 @@ class Options:
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What to measure: refraction, warp, calibration, guidance, slab, drops, rain, align, record, select, train, derain,
-    or all."""
+    """What to measure: refraction, warp, calibration, guidance, slab, drops, rain, align, record, select, train,
+    derain, or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15
