@@ -90,6 +90,26 @@ def test_paired_noise_within_its_sigmas_and_as_certain_as_promised() -> None:
     assert found.sigmas["thickness 0"] / 2 < 2.1e-5
 
 
+@pytest.mark.parametrize(
+    ("noise", "poses", "near", "far", "half"),
+    [(1.0, POSES, 0.25, 0.6, False), (0.1, 5, 0.25, 0.6, False), (0.1, POSES, 0.25, 0.6, True),
+     (0.1, POSES, 0.15, 0.2, False), (0.1, POSES, 1.5, 2.5, False)],
+    ids=["1 px of noise", "5 poses", "wet camera missing in half", "boards at 0.15 m", "boards far away"],
+)  # fmt: skip
+def test_stress_stays_within_its_sigmas(noise: float, poses: int, near: float, far: float, half: bool) -> None:
+    true = synthetic.chamber(15)
+    problem, seen = paired(true, noise, poses=poses, near=near, far=far)
+    if half:
+        problem.observations[(problem.indices[:, 1] == 1) & (problem.indices[:, 0] % 2 == 1), ..., 2] = 0
+    panels = tied(rough(true), poses=poses)
+    found = joint.estimate(problem, seen, panels)
+    pitch, yaw = np.deg2rad(angles(panels.slab.chamber, true))
+    assert abs(pitch) < 4 * found.sigmas["pitch"]
+    assert abs(yaw) < 4 * found.sigmas["yaw"]
+    assert abs(thickness(panels.slab.chamber) - thickness(true)) < 4 * found.sigmas["thickness 0"]
+    assert found.covariance.sigma == pytest.approx(noise, rel=0.1)
+
+
 def test_sigmas_are_those_of_the_scatter_over_tied_poses() -> None:
     """The covariance against its definition: linear response of the solution to noise, by solving again and again."""
     true = synthetic.chamber(20)
