@@ -8,14 +8,14 @@ from rainstereo.calib import gaps, guidance
 from rainstereo.calib.board import Board
 from rainstereo.calib.mrcal_versions import SolveError
 from rainstereo.calib.solve import Solution
-from rainstereo.rig import ROLES
+from rainstereo.rig import ROLES, Role
 from rainstereo.types import Array
 
 WORTH = 0.05
 """A board that lessens the largest sigma by a smaller share is not worth holding up."""
 
 
-def capture_next(report: Report, solution: Solution, board: Board, corners: dict[str, Array]) -> None:
+def capture_next(report: Report, solution: Solution, board: Board, corners: dict[Role, Array]) -> None:
     """Which pose would help most, what the capture lacks, and maps of its corners (per role (F, rows, columns, 2))."""
     wanted = gaps.missing(solution)
     report.section(
@@ -34,7 +34,7 @@ def capture_next(report: Report, solution: Solution, board: Board, corners: dict
         )
 
 
-def _proposal(report: Report, solution: Solution, board: Board, corners: dict[str, Array]) -> None:
+def _proposal(report: Report, solution: Solution, board: Board, corners: dict[Role, Array]) -> None:
     try:
         best = guidance.propose(solution, board)
     except SolveError:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from rainstereo.apps.canvas import DRY, FAINT, INK, RAIN, SERIES, image_axes, sheet, styled
 from rainstereo.apps.figures import ladder, same_length
+from rainstereo.rig import Role
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -115,10 +116,10 @@ def depth_sigmas(depths: npt.ArrayLike, sigmas: Mapping[str, npt.ArrayLike]) -> 
 
 @styled
 def where_to_hold(
-    corners: Mapping[str, npt.ArrayLike],
-    outlines: Mapping[str, npt.ArrayLike],
-    meshes: Mapping[str, Sequence[npt.ArrayLike]],
-    sizes: Mapping[str, tuple[int, int]],
+    corners: Mapping[Role, npt.ArrayLike],
+    outlines: Mapping[Role, npt.ArrayLike],
+    meshes: Mapping[Role, Sequence[npt.ArrayLike]],
+    sizes: Mapping[Role, tuple[int, int]],
 ) -> Figure:
     """A board drawn into each camera's image as it should be held, over the corners seen so far.
 

@@ -231,5 +231,4 @@ def _rig(problem: Problem, chamber: Chamber | None) -> Rig:
 
 
 def _middle(solution: Solution) -> Array:
-    rows, columns = solution.problem.observations.shape[1:3]
-    return versions.board_points(rows, columns, solution.problem.spacing).reshape(-1, 3).mean(0)
+    return np.asarray(solution.problem.board().reshape(-1, 3).mean(0))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from rainstereo import pose
-from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.solve import Solution
 from rainstereo.rig import ROLES
 from rainstereo.types import Array, Mask
@@ -100,7 +99,7 @@ def covered(solution: Solution, camera: int) -> Mask:
 def _centres(solution: Solution) -> tuple[Array, Array]:
     """Middles of the boards in the dry camera's frame, (F, 3), and the board's width and height, metres."""
     problem = solution.problem
-    points = versions.board_points(*problem.observations.shape[1:3], problem.spacing).reshape(-1, 3)
+    points = problem.board().reshape(-1, 3)
     R = pose.rotation_matrix(solution.rt_ref_board[:, :3])
     return R @ points.mean(0) + solution.rt_ref_board[:, 3:], np.ptp(points, axis=0)[:2]
 

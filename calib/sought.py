@@ -102,8 +102,7 @@ def _with_wedge(problem: Problem, seen: Array, panels: Panels, without: Estimate
 
 def _elsewhere(problem: Problem, ties: Indices) -> Mask:
     """Which frames show the board plainly in another place than their partners do, (F,)."""
-    rows, columns = problem.observations.shape[1:3]
-    points = versions.board_points(rows, columns, problem.spacing).reshape(-1, 3)
+    points = problem.board().reshape(-1, 3)
     R, t = pose.rotation_matrix(problem.rt_ref_board[:, :3]), problem.rt_ref_board[:, None, 3:]
     placed = np.einsum("fij,nj->fni", R, points) + t
     return np.asarray(np.linalg.norm(placed - placed[ties], axis=-1).max(-1) > ELSEWHERE)
