@@ -211,6 +211,9 @@ def apparent(slab: Slab, points: Array, centre: Array) -> tuple[Array, types.Sta
 def view(slab: Slab, points: Array, centre: Array) -> View:
     """`apparent` with its derivatives."""
     bend = refraction.apparent_gradients(points, _seen_from(slab, centre))
+    if not slab.free and not any(slab.wedge):
+        nothing = np.zeros((len(points), 3, 0))
+        return View(bend.seen, bend.status, bend.point, nothing, np.zeros((len(points), 3, 3)))
     axes, materials = across(slab.chamber.normal), np.array(slab.materials, dtype=int)
     mine = np.eye(slab.count)[materials].reshape(len(materials), slab.count)
     columns: dict[Kind, Array] = {

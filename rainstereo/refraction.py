@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -303,24 +304,33 @@ class ApparentGradients:
     seen: Array
     status: types.Status
     point: Array
-    normal: Array
-    thickness: Array
-    index: Array
+    _bend: _Bend
+    _along: Array
+
+    @cached_property
+    def normal(self) -> Array:
+        """By the normal."""
+        across = np.eye(3) - self._along * self._along.T
+        return np.asarray(
+            -self._bend.delta[:, None, None] * across - self._along * self._bend.by_normal[:, None, :], np.float64
+        )
+
+    @cached_property
+    def thickness(self) -> Array:
+        """By each panel's thickness."""
+        return np.asarray(-self._along * self._bend.by_thickness[:, None, :], np.float64)
+
+    @cached_property
+    def index(self) -> Array:
+        """By each panel's index."""
+        return np.asarray(-self._along * self._bend.by_index[:, None, :], np.float64)
 
 
 def apparent_gradients(points: Array, chamber: Chamber) -> ApparentGradients:
     """Where a camera at the origin seems to see points, (N, 3), and how that moves with points and panels."""
     bend = _bend(points, chamber)
-    normal = np.asarray(chamber.normal)
-    along = normal[:, None]
-    return ApparentGradients(
-        bend.seen,
-        bend.status,
-        point=np.eye(3) - along * bend.by_point[:, None, :],
-        normal=-bend.delta[:, None, None] * (np.eye(3) - np.outer(normal, normal)) - along * bend.by_normal[:, None, :],
-        thickness=-along * bend.by_thickness[:, None, :],
-        index=-along * bend.by_index[:, None, :],
-    )
+    along = np.asarray(chamber.normal)[:, None]
+    return ApparentGradients(bend.seen, bend.status, np.eye(3) - along * bend.by_point[:, None, :], bend, along)
 
 
 @dataclass(frozen=True, eq=False)
