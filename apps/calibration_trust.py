@@ -65,9 +65,9 @@ def limiting(report: Report, findings: Findings) -> None:
     for label, parts in findings.made_of.items():
         unit = "mm" if label.startswith(("depth", "baseline")) else "px"
         totals.append(quantity(float(np.sqrt(sum(parts.values()))), unit, 2))
-    parts = {name: [findings.made_of[label].get(name, 0.0) for label in labels] for name in names}
+    stacked = {name: [findings.made_of[label].get(name, 0.0) for label in labels] for name in names}
     report.figure(
-        trust_figures.shares(labels, {name: v for name, v in parts.items() if any(v)}, totals),
+        trust_figures.shares(labels, {name: v for name, v in stacked.items() if any(v)}, totals),
         "What the variance of each figure is made of; on the right one sigma of it (over the image: the median).",
     )
     if findings.spread.assumed and findings.spread.slab is not None:

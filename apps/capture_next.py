@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from rainstereo.apps import figures, trust_figures
 from rainstereo.apps.report import Report, quantity
 from rainstereo.calib import gaps, guidance
@@ -15,7 +17,7 @@ WORTH = 0.05
 """A board that lessens the largest sigma by a smaller share is not worth holding up."""
 
 
-def capture_next(report: Report, solution: Solution, board: Board, corners: dict[str, Array]) -> None:
+def capture_next(report: Report, solution: Solution, board: Board, corners: Mapping[str, Array]) -> None:
     """Which pose would help most, what the capture lacks, and maps of its corners (per role (F, rows, columns, 2))."""
     wanted = gaps.missing(solution)
     report.section(
@@ -34,7 +36,7 @@ def capture_next(report: Report, solution: Solution, board: Board, corners: dict
         )
 
 
-def _proposal(report: Report, solution: Solution, board: Board, corners: dict[str, Array]) -> None:
+def _proposal(report: Report, solution: Solution, board: Board, corners: Mapping[str, Array]) -> None:
     try:
         best = guidance.propose(solution, board)
     except SolveError:
@@ -45,9 +47,11 @@ def _proposal(report: Report, solution: Solution, board: Board, corners: dict[st
     if not best.predicted < (1 - WORTH) * best.now:
         report.text(f"No single pose would change the least certain far direction much ({change} at best).")
         return
-    sizes = {role: solution.rig.camera(role).size for role in ROLES}
+    sizes: dict[str, tuple[int, int]] = {role: solution.rig.camera(role).size for role in ROLES}
     report.figure(
-        trust_figures.where_to_hold(corners, best.outlines, best.mesh, sizes),
+        trust_figures.where_to_hold(
+            corners, {str(r): o for r, o in best.outlines.items()}, {str(r): m for r, m in best.mesh.items()}, sizes
+        ),
         f"The pose that would help most: {best.words}. It takes the least certain far "
         f"direction {change}; chosen from {best.considered} poses. Dots are the corners seen so far.",
     )

@@ -115,9 +115,9 @@ def depth_sigmas(depths: npt.ArrayLike, sigmas: Mapping[str, npt.ArrayLike]) -> 
 
 @styled
 def where_to_hold(
-    corners: Mapping[str, npt.ArrayLike],
-    outlines: Mapping[str, npt.ArrayLike],
-    meshes: Mapping[str, Sequence[npt.ArrayLike]],
+    corners: Mapping[str, FloatArray],
+    outlines: Mapping[str, FloatArray],
+    meshes: Mapping[str, Sequence[FloatArray]],
     sizes: Mapping[str, tuple[int, int]],
 ) -> Figure:
     """A board drawn into each camera's image as it should be held, over the corners seen so far.

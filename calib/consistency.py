@@ -167,7 +167,7 @@ def _ties(panels: Panels, kept: Mask) -> Indices | None:
     if panels.ties is None:
         return None
     place = np.cumsum(kept) - 1
-    return np.where(kept[panels.ties], place[panels.ties], place)[kept].astype(np.intp)
+    return np.asarray(np.where(kept[panels.ties], place[panels.ties], place)[kept], dtype=np.intp)
 
 
 def _halves(solution: Solution, first: Mask, distances: Sequence[float], grid: tuple[int, int]) -> Comparison:
@@ -232,4 +232,4 @@ def _rig(problem: Problem, chamber: Chamber | None) -> Rig:
 
 def _middle(solution: Solution) -> Array:
     rows, columns = solution.problem.observations.shape[1:3]
-    return versions.board_points(rows, columns, solution.problem.spacing).reshape(-1, 3).mean(0)
+    return np.asarray(versions.board_points(rows, columns, solution.problem.spacing).reshape(-1, 3).mean(0))

@@ -110,7 +110,7 @@ def _estimated(solution: Solution, estimate: Estimate) -> Contributions:
     normal = refracted.normal_equations(problem, seen_through(problem, panels), panels)
     inverse, _ = regular_inverse(normal.matrix)
     _, by_slab = prior.rows(slab)
-    parts = {}
+    parts: dict[str, Covariance] = {}
     for kind in (kind for kind in slab.free if kind in prior.kinds):
         toward = inverse[:, normal.layout.slab] @ by_slab[_of_kind(slab, kind)].T * total.sigma**2
         toward = panels.spread(normal.layout, toward) * normal.scale[:, None]

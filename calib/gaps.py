@@ -100,7 +100,8 @@ def covered(solution: Solution, camera: int) -> Mask:
 def _centres(solution: Solution) -> tuple[Array, Array]:
     """Middles of the boards in the dry camera's frame, (F, 3), and the board's width and height, metres."""
     problem = solution.problem
-    points = versions.board_points(*problem.observations.shape[1:3], problem.spacing).reshape(-1, 3)
+    rows, columns = problem.observations.shape[1:3]
+    points = versions.board_points(rows, columns, problem.spacing).reshape(-1, 3)
     R = pose.rotation_matrix(solution.rt_ref_board[:, :3])
     return R @ points.mean(0) + solution.rt_ref_board[:, 3:], np.ptp(points, axis=0)[:2]
 
