@@ -241,7 +241,7 @@ class Plan:
 
     @cached_property
     def _paste_all(self) -> Paste:
-        return Paste(self.tables)
+        return Paste(self.tables, self.renderer.scene_size)
 
     def _in_light(self, image: Image, out: Image) -> None:
         """The same, averaging light; only pixels that drops touch are converted back."""
