@@ -26,6 +26,7 @@ from rainstereo.types import Array, Image, Indices, Mask, Status
 
 from .lookups import Lookups
 from .quadtree import Quadtree
+from .samples import Samples
 
 RAYS = 2  # along a pixel's side, to begin with
 CHUNK = 4096  # pixels traced at a time with all their rays
@@ -71,24 +72,6 @@ class Batch:
         return [Batch(self.drops, self.pixels[p], self.groups[p], self.which[p]) for p in pieces]
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Rays of pixels, s x s each, row by row: source (s^2, M, 2) finite, gain and opacity (s^2, M), all float32."""
-
-    source: Array
-    gain: Array
-    opacity: Array
-
-    @property
-    def side(self) -> int:
-        """s."""
-        return math.isqrt(len(self.gain))
-
-    def take(self, rows: Indices) -> Samples:
-        """Those of some pixels."""
-        return Samples(self.source[:, rows], self.gain[:, rows], self.opacity[:, rows])
-
-
 def rays_along(tolerance: float) -> int:
     """Rays along a pixel's side."""
     return 8 if tolerance < 2.5 else 4 if tolerance < math.inf else RAYS
@@ -111,7 +94,7 @@ class Minifier:
     border: str = "mirror"
 
     def __post_init__(self) -> None:
-        self._clear = _clear_map(self.camera, self.chamber)
+        self.clear = _clear_map(self.camera, self.chamber)
 
     def lookups(self, batches: Sequence[Batch]) -> list[Lookups]:
         """What every pixel of the batches that a drop covers looks at."""
@@ -128,21 +111,24 @@ class Minifier:
     def _of_some(self, batches: Sequence[Batch]) -> list[Lookups]:
         side = rays_along(self.tolerance)
         if side == RAYS:
-            return [self._look(batch, np.arange(len(batch.pixels)), self._trace(batch, side)) for batch in batches]
-        kinds = [_kind(self._trace(batch, RAYS)) for batch in batches]
+            return [self._look(batch, np.arange(len(batch.pixels)), self.traced(batch, side)) for batch in batches]
+        kinds = [_kind(self.traced(batch, RAYS)) for batch in batches]
+        ends = np.cumsum([len(kind) for kind in kinds])[:-1]
+        edges = np.split(self.edges(np.concatenate([b.pixels for b in batches]), np.concatenate(kinds)), ends)
         found: list[Lookups] = []
-        for batch, kind, edge in zip(batches, kinds, self._edges(batches, kinds), strict=True):
+        for batch, kind, edge in zip(batches, kinds, edges, strict=True):
             rows = np.flatnonzero(edge | (kind == LIT))
             for first in range(0, len(rows), CHUNK):
                 part = rows[first : first + CHUNK]
-                found.append(self._look(batch, part, self._trace(batch, side, part)))
+                found.append(self._look(batch, part, self.traced(batch, side, part)))
             dark = np.flatnonzero(~edge & (kind == DARK))
             found.append(self._look(batch, dark, _darkness(len(dark))))
         return found
 
     # -- tracing -------------------------------------------------------------------------------------------------------
 
-    def _trace(self, batch: Batch, side: int, rows: Indices | slice = slice(None)) -> Samples:
+    def traced(self, batch: Batch, side: int, rows: Indices | slice = slice(None)) -> Samples:
+        """Side x side rays of pixels of a batch, some or all."""
         number = batch.pixels[rows]
         width = self.camera.width
         own: Image = np.stack([number % width, number // width], -1).astype(np.float32)
@@ -161,22 +147,21 @@ class Minifier:
                 drops, labels, pixels = _labelled(batch.drops, batch.which[rows][part], pixels)
             traced = trace(pixels, drops, self.camera, self.chamber, self.depth, which=labels)
             # a patch of another shape, for what it makes of a trace
-            clear = np.resize(self._clear[number[part]], pixels.shape[1])
+            clear = np.resize(self.clear[number[part]], pixels.shape[1])
             found = Patch.of_trace(traced, slice(0, side * side), slice(0, pixels.shape[1]), 1.0, clear)
             count = part.stop - first
             source[:, part], gain[:, part] = found.source[:, :count], found.gain[:, :count]
             opacity[:, part] = found.opacity[:, :count]
         return Samples(source, gain, opacity)
 
-    def _edges(self, batches: Sequence[Batch], kinds: Sequence[Status]) -> list[Mask]:
-        """Which pixels of each batch show something else than their neighbours."""
+    def edges(self, pixels: Indices, kinds: Status) -> Mask:
+        """Which pixels show something else than their neighbours; kinds: (M,), 0 for nothing."""
         width, height = self.camera.size
         of_frame: Status = np.full((height, width), NOTHING, dtype=np.uint8)
-        for batch, kind in zip(batches, kinds, strict=True):
-            of_frame.ravel()[batch.pixels] = kind
+        of_frame.ravel()[pixels] = kinds
         around = np.ones((3, 3), dtype=np.uint8)
         rough = cv2.dilate(of_frame, around) != cv2.erode(of_frame, around)
-        return [rough.ravel()[batch.pixels] for batch in batches]
+        return np.asarray(rough.ravel()[pixels])
 
     # -- taps ----------------------------------------------------------------------------------------------------------
 

@@ -11,9 +11,8 @@ from functools import cache
 import cv2
 import numpy as np
 
-from rainstereo.types import Array, Image
-
 from rainstereo.scene_statistics import SceneStatistics
+from rainstereo.types import Array, Image
 
 SMALLEST = 4  # pixels along the shorter side
 BIAS = 0.125  # gray levels by which OpenCV's mean of four bytes is too large: it rounds halves up

@@ -69,7 +69,7 @@ class Quadtree:
         return Taps(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("texels", "weights", "counts", "error")))
 
     def _some(self, x: Array, y: Array, weights: Array, side: int) -> Taps:
-        steps = _steps(x, y, weights)
+        steps = steps_between(x, y, weights)
         span = _span(x, y, weights)
         loose = self._is_loose(span, steps, weights)
         if loose.any():
@@ -144,7 +144,11 @@ class Quadtree:
         """Level, row and column of the texels that cells of windows are, after so many merges."""
         wide, high = (np.array([size[i] for size in sizes(self.size)]) for i in (0, 1))
         x, y = (at[cell] for at in _places(side)[merge])
-        return level, np.minimum(y + (row >> merge), high[level] - 1), np.minimum(x + (column >> merge), wide[level] - 1)
+        return (
+            level,
+            np.minimum(y + (row >> merge), high[level] - 1),
+            np.minimum(x + (column >> merge), wide[level] - 1),
+        )
 
     def _window(self, x: Array, y: Array, weights: Array, span: Array) -> tuple[Indices, Indices, Indices]:
         """Of each pixel the level, and the first column and row of a window of it that holds the rays."""
@@ -281,7 +285,7 @@ def _mixed(second: Mask, one: Taps, other: Taps) -> Taps:
     return Taps(found[0], found[1], counts, error)
 
 
-def _steps(x: Array, y: Array, weights: Array) -> Steps:
+def steps_between(x: Array, y: Array, weights: Array) -> Steps:
     """From each ray, (K, M), to its right neighbour, x and y, and its lower one: the shorter of both sides' steps."""
     side, far = math.isqrt(len(x)), np.float32(np.inf)
     shape = (side, side, weights.shape[1])

@@ -114,6 +114,11 @@ class PaneShapes:
         return found
 
 
+def joined_shapes(drops: Drops) -> list[Drop]:
+    """Shapes of drops of which those that touch are one body, of their volume. Drops too steep to merge stay caps."""
+    return [shape for members in _members(drops) for shape in _body(members)]
+
+
 def _members(drops: Drops) -> list[Drops]:
     """The drops of each body."""
     steep = drops.contact_angle > STEEPEST
@@ -132,4 +137,4 @@ def _bytes(*columns: Array) -> bytes:
     return b"".join(column.tobytes() for column in columns)
 
 
-__all__ = ["PaneShapes", "Sequence"]
+__all__ = ["PaneShapes", "Sequence", "joined_shapes"]
