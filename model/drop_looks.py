@@ -27,7 +27,8 @@ MODELS = ("exact", "texture")
 RAYS = 2  # along a cell's side, to begin with
 SIDES = (1, 2, 3, 4, 6)
 LOOKS, POWER = 1.45, 0.34375
-"""Looks along a cell's side: a factor and a power of its footprint's side in pixels. This is good for 2 gray levels RMS of 8 bits."""
+"""Looks along a cell's side: a factor and a power of its footprint's side in pixels. This is good for 2 gray levels
+RMS of 8 bits."""
 SHARPER = 0.6  # octaves by which the copies looked at are finer than the spacing of looks
 EVEN, STRETCH = 0.9, 1.15  # least ratio of gains, largest of steps between looks, within a cell that has no edge
 

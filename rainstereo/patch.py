@@ -242,8 +242,8 @@ def folded(source: Array, size: tuple[int, int], border: str = "mirror") -> Arra
     return folded_along(source, last, border)
 
 
-def folded_along(values: Array, last: float | Array, border: str = "mirror") -> Array:
-    """One coordinate of source pixels, any shape, brought between 0 and `last`, the outermost pixel's (see `folded`)."""
+def folded_along(values: Array, last: Any, border: str = "mirror") -> Array:
+    """One coordinate of source pixels, any shape, brought between 0 and `last`, the outermost pixel's; see `folded`."""
     end = np.asarray(last, dtype=np.float32)
     if border == "mirror":
         period = np.maximum(2 * end, np.float32(1))

@@ -107,13 +107,14 @@ class Glance:
         few = np.flatnonzero(beside & (share > 0))  # the ray misses what covers a part of the pixel: as its neighbour
         nearest = np.stack([other[few] for other in around])
         best = nearest[room[nearest].argmax(0), np.arange(len(few))]
-        for column in (gain, sx, sy):
-            column[few] = column[best]
+        gain[few] = gain[best]
+        like = np.arange(len(pixels))
+        like[few] = best
         rim = self._rim(pixels, gain > 0, share > 0)
         shown = np.flatnonzero((share > 0) & (gain > 0) & ~rim)
         dark = np.flatnonzero((share > 0) & (gain == 0) & ~rim)
         gain *= share
-        found = self._inside(pixels, groups, shown, sx, sy, gain, 1 - share, around)
+        found = self._inside(pixels, groups, shown, sx, sy, gain, 1 - share, around, like)
         found += self._dark(pixels[dark], groups[dark], 1 - share[dark])
         at = np.flatnonzero(rim)
         rays, none = (own[at] + SUBPIXELS[:, None]).reshape(-1, 2), len(SUBPIXELS)
@@ -182,13 +183,15 @@ class Glance:
 
     def _inside(
         self, pixels: Indices, groups: Indices, rows: Indices, x: Array, y: Array, gain: Array, clear: Array,
-        around: tuple[Indices, Indices, Indices, Indices],
+        around: tuple[Indices, Indices, Indices, Indices], like: Indices | None = None,
     ) -> list[Looks]:  # fmt: skip
-        """Looks of pixels whose neighbours show the scene, too."""
-        left, right, above, below = (beside[rows] for beside in around)
-        own_x, own_y = x[rows], y[rows]
-        across = _shorter(own_x, own_y, x, y, left, right)
-        along = _shorter(own_x, own_y, x, y, above, below)
+        """Looks of pixels as their neighbours that show the scene, too, tell; like: (P,) whose places they show."""
+        place = rows if like is None else like[rows]
+        left, right, above, below = (beside[place] for beside in around)
+        own_x, own_y = x[place], y[place]
+        lit = gain > 0
+        across = _shorter(place, x, y, lit, left, right)
+        along = _shorter(place, x, y, lit, above, below)
         lengths = [a * a + b * b for a, b in (across, along)]
         wide = lengths[0] >= lengths[1]
         long = [np.where(wide, a, b) for a, b in zip(across, along, strict=True)]
@@ -276,13 +279,14 @@ def _y(samples: Samples) -> Array:
     return samples.source[0, :, 1]
 
 
-def _shorter(own_x: Array, own_y: Array, x: Array, y: Array, one: Indices, other: Indices) -> tuple[Array, Array]:
-    """The shorter of the steps from one neighbour to the pixel, and from it to the other, unless that is 0."""
-    ax, ay = own_x - x[one], own_y - y[one]
-    bx, by = x[other] - own_x, y[other] - own_y
-    a, b = ax * ax + ay * ay, bx * bx + by * by
-    first = (a < b) & (a > 0) | (b == 0)
-    return np.where(first, ax, bx), np.where(first, ay, by)
+def _shorter(own: Indices, x: Array, y: Array, lit: Mask, one: Indices, other: Indices) -> tuple[Array, Array]:
+    """The shorter of the steps from one neighbour to the pixel, and from it to the other; 0 where neither is lit."""
+    ax, ay, bx, by = x[own] - x[one], y[own] - y[one], x[other] - x[own], y[other] - y[own]
+    far = np.float32(np.inf)
+    a = np.where(lit[one] & (one != own), ax * ax + ay * ay, far)
+    b = np.where(lit[other] & (other != own), bx * bx + by * by, far)
+    first, none = a < b, np.isinf(np.minimum(a, b))
+    return tuple(np.where(none, np.float32(0), np.where(first, *pair)) for pair in ((ax, bx), (ay, by)))  # type: ignore[return-value]
 
 
 def _face_map(minifier: Minifier, panel: int) -> tuple[Array, Array, Array]:

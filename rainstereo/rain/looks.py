@@ -55,8 +55,13 @@ class Looks:
     def of_groups(self, groups: Indices) -> Looks:
         """Those of some groups."""
         keep = np.isin(self.groups, groups)
-        columns = [getattr(self, f.name) for f in fields(self)[1:]]
-        return self if keep.all() else Looks(self.fine, *(a[:, keep] if a is self.place else a[keep] for a in columns))
+        if keep.all():
+            return self
+        kept: dict[str, Any] = {}
+        for field in fields(self)[1:]:
+            values = getattr(self, field.name)
+            kept[field.name] = values[:, keep] if field.name == "place" else values[keep]
+        return Looks(fine=self.fine, **kept)
 
     def add(self, scene: Image, rows: slice, total: Image) -> None:
         """Write the sum of some pixels' looks at the image, or its copies, to `total`, (M, C)."""
@@ -128,7 +133,7 @@ def copies(image: Image) -> Image:
 
 @dataclass(frozen=True, eq=False)
 class Shelf:
-    """Where copies stand, (2 L,) each, two to an octave: a place of the image is scale x + offset, at most last, + first.
+    """Where copies stand, (2 L,) each, two to an octave: a place x of the image is scale x + offset, <= last, + first.
 
     Copies finer than `DOUBLE` come twice. last, first: of x and of y.
     """

@@ -63,7 +63,7 @@ class Quadtree:
         side = -(-(self.extent + ALIGNED) // ALIGNED) * ALIGNED
         step = max(1, CELLS // side**2)
         parts = [
-            self._some(*(columns[:, i : i + step] for columns in (x, y, weights)), side)
+            self._some(x[:, i : i + step], y[:, i : i + step], weights[:, i : i + step], side)
             for i in range(0, max(weights.shape[1], 1), step)
         ]
         return Taps(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("texels", "weights", "counts", "error")))
@@ -73,12 +73,12 @@ class Quadtree:
         span = _span(x, y, weights)
         loose = self._is_loose(span, steps, weights)
         if loose.any():
-            one, other = np.flatnonzero(~loose), np.flatnonzero(loose)
-            return _mixed(
-                loose,
-                self._together(*_columns((x, y, weights), steps, one), span[one], side),
-                self._apart(*_columns((x, y, weights), steps, other)),
-            )
+            tight = np.flatnonzero(~loose)
+            rays = [columns[:, tight] for columns in (x, y, weights)]
+            one = self._together(rays[0], rays[1], rays[2], _of(steps, tight), span[tight], side)
+            apart = np.flatnonzero(loose)
+            rays = [columns[:, apart] for columns in (x, y, weights)]
+            return _mixed(loose, one, self._apart(rays[0], rays[1], rays[2], _of(steps, apart)))
         return self._together(x, y, weights, steps, span, side)
 
     def _is_loose(self, span: Array, steps: Steps, weights: Array) -> Mask:
@@ -118,11 +118,13 @@ class Quadtree:
             some = np.flatnonzero((level == 0) == fine)
             if some.size:
                 few = slice(None) if some.size == count else some
-                here = [c[:, few] for c in (*own, weights)]
-                scaled = [step[:, few] * scale[few] for step in steps]
-                cells[few] = _around(*here, side) if fine else _inside(*here, scaled, side)
+                u, v, share = (columns[:, few] for columns in (*own, weights))
+                if fine:
+                    cells[few] = _around(u, v, share, side)
+                else:
+                    cells[few] = _inside(u, v, share, [step[:, few] * scale[few] for step in steps], side)
         uneven, error, found = unevenness(len(sizes(self.size))), np.zeros(count), []
-        closed = np.zeros(cells.shape, dtype=np.bool_)
+        closed: Mask = np.zeros(cells.shape, dtype=np.bool_)
         for merge in range(MERGES + 1):
             kept = cells
             if merge < MERGES:
@@ -160,7 +162,7 @@ class Quadtree:
         column, row = (np.maximum(at, 0) & -ALIGNED for at in first)
         return level, column, row
 
-    def _merge(self, cells: Array, closed: Array, uneven: Array, level: Indices) -> tuple[Array, Array, Array, Array]:
+    def _merge(self, cells: Array, closed: Mask, uneven: Array, level: Indices) -> tuple[Array, Array, Array, Mask]:
         """Cells of the next level, (M, s / 4), what stays on this one, the square error, cells not to be merged."""
         count = len(cells)
         shape = (count, 4, cells.shape[1] // 4)
@@ -183,7 +185,7 @@ class Quadtree:
 
 @cache
 def _order(side: int) -> Any:
-    """Number, (side^2,) int32, of each cell of a window, row by row: those that merge are far apart, their parents near.
+    """Number, (side^2,) int32, of each cell of a window, row by row: cells that merge are far apart.
 
     The lowest bits of column and row come first, then the next, and what is left of them last.
     """
@@ -263,10 +265,10 @@ def _span(x: Array, y: Array, weights: Array) -> Array:
     return np.maximum(right - left, bottom - top)
 
 
-def _columns(arrays: Sequence[Array], steps: Steps, some: Indices) -> tuple[Any, ...]:
-    """Some pixels' columns of arrays, and of steps."""
+def _of(steps: Steps, some: Indices) -> Steps:
+    """Steps of some pixels."""
     a, b, c, d = (step[:, some] for step in steps)
-    return *(array[:, some] for array in arrays), (a, b, c, d)
+    return a, b, c, d
 
 
 def _mixed(second: Mask, one: Taps, other: Taps) -> Taps:

@@ -81,8 +81,8 @@ class Renderer:
     look a pixel, and hard edges, which is the fastest.
     border: what lies beyond the image: "mirror", "edge", or a `Surround` of it, beyond which it is mirrored.
     linear_light: whether values are sRGB and light is to be averaged, not values.
-    moving: whether most drops move from frame to frame: plans are made some fifty times as fast, and frames drawn with
-    up to twice the error of the same tolerance, in more time (`glance`).
+    moving: whether most drops move from frame to frame: plans of caps on one far face are made some fifty times as
+    fast, frames drawn in about twice the time, and pixels in drops off by 4 gray levels or so (`glance`).
     """
 
     camera: Camera
