@@ -328,7 +328,7 @@ def _nothing(_: object) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Pixels inside drops, (N,) rows and columns, their rays' sources (N, K, 2) and gains (N, K), the share hidden (N,)."""
+    """Pixels in drops, (N,) rows and columns; their rays' sources (N, K, 2) and gains (N, K); hidden: (N,) share."""
 
     rows: Indices
     columns: Indices

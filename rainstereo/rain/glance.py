@@ -124,7 +124,7 @@ class Glance:
 
     def _traced(
         self, pixels: Array, caps: Sequence[SphericalCap], which: Indices, clear: Array
-    ) -> tuple[Array, Array, Any]:
+    ) -> tuple[Any, Any, Any]:
         """Sources, (P, 2), 0 where it is dark; gains; and fates. clear: the bare pane's transmittance."""
         minifier = self.minifier
         seen = trace(pixels, caps, minifier.camera, minifier.chamber, minifier.depth, which=which)
@@ -227,7 +227,8 @@ class Glance:
         return found + self._look(pixels[lit], groups[lit], spread, size / 12, gain[lit], clear[lit], moved)
 
     def _dark(self, pixels: Indices, groups: Indices, clear: Array | float = 0.0) -> list[Looks]:
-        count, none = len(pixels), np.zeros(len(pixels), dtype=np.float32)
+        count = len(pixels)
+        none: Image = np.zeros(count, dtype=np.float32)
         share: Image = np.broadcast_to(np.asarray(clear, dtype=np.float32), count).copy()
         moved: Image = np.full((count, 2), np.nan, dtype=np.float32)
         empty: Image = np.zeros((0, count, 2), dtype=np.float32)

@@ -133,7 +133,7 @@ def test_a_glance_at_moving_drops(name):
     careful = Renderer(CAMERA, chamber, DEPTH).plan(drops).render(image)
     quick = Renderer(CAMERA, chamber, DEPTH, moving=True).plan(drops).render(image)
     inside = careful.opacity > 0
-    assert rms((quick.image.astype(float) - careful.image)[inside]) <= 8.0  # a drop drawn with one look: 20
+    assert rms((quick.image.astype(float) - careful.image)[inside]) <= 8.0
     assert rms(quick.opacity - careful.opacity) <= 0.02
     np.testing.assert_array_equal(quick.image[~quick.drop_mask], image[~quick.drop_mask])
     both = np.isfinite(quick.displacement).all(-1) & np.isfinite(careful.displacement).all(-1) & (quick.opacity == 1)
