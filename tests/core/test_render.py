@@ -114,7 +114,7 @@ def test_within_a_gray_level_of_576_rays_a_pixel(name):
 
 def test_tolerance_trades_looks_for_error():
     image, drops = photograph(), SCENES["lone"][1]
-    expected, covered = brute_force(image, drops, CAMERA, PANE, DEPTH)
+    expected, covered = brute_force(image, drops, CAMERA, PANE, DEPTH, 24)
     errors, looks = [], []
     for tolerance in (1.0, 4.0, 16.0, math.inf):
         plan = Renderer(CAMERA, PANE, DEPTH, tolerance=tolerance).plan(drops)
