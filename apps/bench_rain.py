@@ -333,7 +333,7 @@ class Truth:
     rows: Indices
     columns: Indices
     source: Array
-    gain: Array
+    gain: Any
     hidden: Array
 
     @classmethod

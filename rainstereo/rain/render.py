@@ -137,7 +137,7 @@ class Renderer:
         outlines = Outlines.of(drops, self.camera, self.chamber)
         return [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in outlines.groups()]
 
-    def lookups(self, groups: Sequence[Group], numbers: Iterable[int]) -> list[Lookups] | list[Looks]:
+    def lookups(self, groups: Sequence[Group], numbers: Iterable[int]) -> list[Any]:
         """What pixels look at in groups of drops, which get these numbers."""
         if not groups:
             return []
