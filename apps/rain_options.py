@@ -48,6 +48,8 @@ class Options:
     """Population in place of the preset's: adherent, paper, mist, drops, large or streaks."""
     cover: float | None = None
     """Share of the pane that is wet, 0 to 0.95, in place of the population's."""
+    merge: bool = False
+    """Make one body of drops that touch, of their volume, on images, too; in motion they always are."""
     focal_px: float | None = None
     """Focal length in pixels at the images' own width, in place of the preset's."""
     distance_mm: float | None = None
@@ -143,7 +145,7 @@ def settings(options: Options, images: list[Source]) -> Rain:
     rain = Rain(
         _setup(options, images), options.seed, options.depth_m, options.tolerance, options.border,
         options.linear_light, options.psnr, options.psnr_tolerance, None, seen,
-        None if options.drops is None else options.drops.read_text(encoding="utf-8"),
+        None if options.drops is None else options.drops.read_text(encoding="utf-8"), options.merge,
     )  # fmt: skip
     listed = rain.drop_list
     rain.renderer(listed[0].camera.size if listed else seen[0].size if seen else (64, 48))  # says what is wrong

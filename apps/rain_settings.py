@@ -17,6 +17,7 @@ from rainstereo.rain.drops import Drops
 from rainstereo.rain.motion import Motion
 from rainstereo.rain.pane import Pane
 from rainstereo.rain.render import AnyDrops, Plan, Renderer
+from rainstereo.rain.sequence import joined_shapes
 from rainstereo.rain.severity import HEAVIEST, Met, NestedRain, UnreachablePsnrError, heaviest_cover, meet_psnr
 from rainstereo.types import Image
 
@@ -33,6 +34,7 @@ class Rain:
     psnr: to be met, dB, for each image, within psnr_tolerance; None: the population's own cover.
     share: of the heaviest rain's drops, for all images, in place of both; see `over_set`.
     listed: a drop list to be rendered on all images in place of everything else.
+    merge: whether drops that touch become one body on images, too.
     """
 
     setup: Setup
@@ -46,6 +48,7 @@ class Rain:
     share: float | None = None
     seen: tuple[Camera, Chamber] | None = None
     listed: str | None = None
+    merge: bool = False
 
     # -- what it is seen through ---------------------------------------------------------------------------------------
 
@@ -101,10 +104,13 @@ class Rain:
     def standing(self, drops: Drops, name: str, size: Size) -> AnyDrops:
         """What there is to be seen of drops on a still: where the setup gives them time, some have run."""
         if not self.setup.age:
-            return self.in_sight(drops, size)
+            return self._shown(self.in_sight(drops, size))
         seed = int(self.seeds(f"{name}, motion").integers(2**62))
         state = Motion.physical(drops, self.pane(size), seed=seed).at(self.setup.age)
-        return [*(trail.streak(**drops.place) for trail in state.trails), self.in_sight(state.drops, size)]
+        return [*(trail.streak(**drops.place) for trail in state.trails), self._shown(self.in_sight(state.drops, size))]
+
+    def _shown(self, drops: Drops) -> AnyDrops:
+        return joined_shapes(drops) if self.merge else drops
 
     def drops(self, name: str, size: Size) -> Drops:
         """What falls on an image where no PSNR is asked for."""

@@ -239,10 +239,16 @@ def folded(source: Array, size: tuple[int, int], border: str = "mirror") -> Arra
     if border not in BORDERS:
         raise ValueError(f"border {border!r} is unknown; expected {' or '.join(map(repr, BORDERS))}")
     last = np.array([size[0] - 1, size[1] - 1], dtype=np.float32)
+    return folded_along(source, last, border)
+
+
+def folded_along(values: Array, last: Any, border: str = "mirror") -> Array:
+    """One coordinate of source pixels, any shape, brought between 0 and `last`, the outermost pixel's; see `folded`."""
+    end = np.asarray(last, dtype=np.float32)
     if border == "mirror":
-        period = np.maximum(2 * last, 1)
-        source = last - np.abs(last - np.abs(source) % period)
-    inside: Array = np.clip(source, 0, last).astype(np.float32, copy=False)
+        period = np.maximum(2 * end, np.float32(1))
+        values = end - np.abs(end - np.abs(values) % period)
+    inside: Array = np.clip(values, 0, end).astype(np.float32, copy=False)
     return inside
 
 

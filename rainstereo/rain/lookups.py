@@ -1,90 +1,85 @@
-"""Looks at the scene, packed into tables that OpenCV interpolates: what each covered pixel of a frame is made of.
+"""Weighted sums of texels: what each covered pixel of a frame is made of, whatever the image.
 
-A pixel is gain x the mean of its looks + clear x the clear image's own pixel. Tables are made once and serve every
-frame; those of some drops can be picked out and joined, which costs a copy.
+A pixel is the sum of its taps, texels of the image and its halves (`pyramid`) times weights, + clear x the image's own
+pixel. Tables are made once and serve every frame; those of some drops can be picked out and joined, which costs a copy.
+
+Bytes are summed three channels at a time: a word of 64 bits holds them 21 bits apart, and a sum of words times whole
+numbers is the three sums, as long as none of them reaches 2^21 (L. Lamport, "Multiple byte processing with full-word
+instructions", CACM 18, 1975). Then the sparse product costs a multiplication for each tap, not for each channel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
-import cv2
 import numpy as np
+from scipy.sparse import csr_array
 
-from rainstereo.layer import depth_of
 from rainstereo.types import Array, Image, Indices, Mask
 
-from .pyramid import halves, in_level, sizes
+from .pyramid import BIAS, half, starts
+from .quadtree import UNIT, Taps
 
-ACROSS = 1024  # looks in a row of a map
-JOINED = 1 << 16  # pixels up to which tables are joined
-MANY = 1 << 24  # looks from which joining would take too much memory
-TOGETHER = 1 << 18  # looks interpolated at a time: few enough for the caches
+FIELD = 21  # bits of a channel in a word
+PACKED = 3  # channels in a word
+EVERY = 1 + (1 << FIELD) + (1 << (2 * FIELD))
+OVER = EVERY << 8
+SHIFT = UNIT.bit_length() - 1
+LITTLE = sys.byteorder == "little"
+KEPT = 1 << 23  # taps up to which a frame's sums are kept as matrices
+JOINED = 1 << 22  # taps up to which tables are joined
+ROWS = 1 << 14  # that are summed at a time
+SPARSE = 0.4  # share of a level's texels below which they are picked out one by one
+DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black
 
 
 @dataclass(frozen=True, eq=False)
 class Lookups:
-    """Pixels with as many looks each.
+    """Pixels and their taps.
 
-    coarse: whether they look at the image's `halves`. pixels: (M,) int32 numbers of pixels, row by row. groups: (M,)
-    int32, of the drops that were traced together. place: (n, M, 2) int16, fraction: (n, M) uint16, OpenCV's maps.
-    gain, clear: (M,) float32. displacement: (M, 2) float32, pixels, of the mean look from the pixel; NaN where it is
-    dark. unknown: (M,) whether a look falls beyond the image that holds the scene.
+    pixels: (M,) int32 numbers of pixels, row by row. groups: (M,) int32, of the drops that were traced together.
+    counts: (M,) int32 of taps. texels: (T,) int32, `pyramid.starts`. weights: (T,) uint16, in 1/`UNIT`.
+    clear: (M,) float32. displacement: (M, 2) float32, pixels, from the pixel to the mean of what it looks at; NaN where
+    it is dark. unknown: (M,) whether a ray falls beyond the image that holds the scene.
+    error: (M,) float32, expected square of what fewer taps cost, gray levels.
     """
 
-    coarse: bool
     pixels: Any
     groups: Any
-    place: Any
-    fraction: Any
-    gain: Array
+    counts: Any
+    texels: Any
+    weights: Any
     clear: Array
     displacement: Array
     unknown: Mask
+    error: Array
 
     @classmethod
     def of(
-        cls,
-        pixels: Indices,
-        groups: Indices,
-        source: Array,
-        octave: Array,
-        gain: Array,
-        clear: Array,
-        displacement: Array,
-        unknown: Mask,
-        size: tuple[int, int],
-    ) -> list[Lookups]:
-        """Tables of looks at `source`, (n, M, 2), in an image of `size`, averaged over 2^octave pixels."""
-        levels = np.clip(np.rint(octave), 0, len(sizes(size)) - 1).astype(np.intp)
-        found = []
-        for coarse in np.unique(levels > 0).tolist():
-            at = np.flatnonzero((levels > 0) == coarse)
-            scaled = in_level(source[:, at], size, np.broadcast_to(levels[at], (len(source), len(at))))
-            place, fraction = cv2.convertMaps(scaled.reshape(1, -1, 2), None, cv2.CV_16SC2)  # type: ignore[call-overload]
-            found.append(
-                cls(
-                    coarse, pixels[at].astype(np.int32), groups[at].astype(np.int32), place.reshape(scaled.shape),
-                    fraction.reshape(scaled.shape[:2]), gain[at].astype(np.float32), clear[at].astype(np.float32),
-                    displacement[at], unknown[at],
-                )
-            )  # fmt: skip
-        return found
+        cls, pixels: Indices, groups: Indices, taps: Taps, clear: Array, displacement: Array, unknown: Mask
+    ) -> Lookups:
+        """A table of taps that were found for pixels."""
+        return cls(
+            pixels.astype(np.int32), groups.astype(np.int32), taps.counts.astype(np.int32), taps.texels, taps.weights,
+            clear.astype(np.float32), displacement.astype(np.float32), unknown, taps.error.astype(np.float32),
+        )  # fmt: skip
 
     @classmethod
     def joined(cls, parts: list[Lookups]) -> list[Lookups]:
-        """The same looks in few tables; empties the list, to spare memory. Where there are many, large ones stay."""
-        most = JOINED if sum(part.fraction.size for part in parts) < MANY else JOINED >> 6
-        parts.sort(key=lambda part: (-len(part.fraction), -part.coarse))
+        """The same in few tables; empties the list, to spare memory."""
         tables: list[Lookups] = []
+        parts.reverse()
         while parts:
             same = [parts.pop()]
-            kind, count = (len(same[0].fraction), same[0].coarse), len(same[0].pixels)
-            while parts and count < most and (len(parts[-1].fraction), parts[-1].coarse) == kind:
+            taps = len(same[0].texels)
+            while parts and taps + len(parts[-1].texels) <= JOINED:
                 same.append(parts.pop())
-                count += len(same[-1].pixels)
+                taps += len(same[-1].texels)
             tables.append(same[0] if len(same) == 1 else _joined(same))
         return tables
 
@@ -93,92 +88,202 @@ class Lookups:
         keep = np.isin(self.groups, groups)
         if keep.all():
             return self
-        return Lookups(self.coarse, *(a[:, keep] if name in WIDE else a[keep] for name, a in self._columns()))
+        taps = np.repeat(keep, self.counts)
+        return Lookups(*(a[taps] if name in OF_TAPS else a[keep] for name, a in self.columns()))
 
-    def _columns(self) -> list[tuple[str, Any]]:
-        return [(f.name, getattr(self, f.name)) for f in fields(self)[1:]]
-
-    def add(self, scene: Image, total: Image) -> None:
-        """Write the sum of each pixel's looks at the image, or its halves, to `total`, (M, C)."""
-        looks, count = self.fraction.shape
-        step = max(1, TOGETHER // (looks * ACROSS)) * ACROSS
-        for first in range(0, count, step):
-            part = slice(first, min(first + step, count))
-            rows = -(-looks * (part.stop - first) // ACROSS)
-            place, fraction = (_rows(a[:, part], rows) for a in (self.place, self.fraction))
-            found = cv2.remap(scene, place, fraction, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            found = found.reshape(rows * ACROSS, -1)[: looks * (part.stop - first)]
-            planes = found.reshape(looks, part.stop - first, -1)
-            np.add.reduce(planes, 0, dtype=total.dtype, out=total[part])
+    def columns(self) -> list[tuple[str, Any]]:
+        """Names and values of all fields."""
+        return [(f.name, getattr(self, f.name)) for f in fields(self)]
 
 
-WIDE = ("place", "fraction")  # columns with a row for each look
+OF_TAPS = ("texels", "weights")
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Rows of a table that are summed together: few enough for the caches.
+
+    matrices: made for the first frame and kept, by the type of the numbers that are summed, if there are not too many.
+    """
+
+    table: Lookups
+    rows: slice
+    taps: slice
+
+    @classmethod
+    def of(cls, table: Lookups) -> list[Piece]:
+        """The pieces of a table."""
+        ends = np.concatenate([[0], np.cumsum(table.counts)]).tolist()
+        cuts = [*range(0, len(table.pixels), ROWS), len(table.pixels)]
+        return [cls(table, slice(a, b), slice(ends[a], ends[b])) for a, b in pairwise(cuts)]
+
+    def matrix(self, number: Any, kind: type, columns: int) -> Any:
+        """As a sparse matrix. number: of each texel among those that are looked at."""
+        ends = np.concatenate([[0], np.cumsum(self.table.counts[self.rows])]).astype(np.int32)
+        weights, texels = self.table.weights[self.taps].astype(kind), number[self.table.texels[self.taps]]
+        return csr_array((weights, texels, ends), shape=(len(ends) - 1, columns))
 
 
 class Paste:
-    """Tables of one frame, with what is done to all pixels of them at once."""
+    """Tables of one frame, and what is done to all pixels of them at once. size: (width, height) of the images."""
 
-    def __init__(self, tables: Sequence[Lookups]) -> None:
-        self.tables = list(tables)
-        self.ends = np.cumsum([0] + [len(table.pixels) for table in tables]).tolist()
+    def __init__(self, tables: Sequence[Lookups], size: tuple[int, int]) -> None:
+        tables = [table for table in tables if len(table.pixels)]
+        self.tables, self.size = tables, size
+        self.pieces = [piece for table in tables for piece in Piece.of(table)]
         self.pixels = _column(tables, "pixels", np.intp)
-        self.clear = _column(tables, "clear", np.float32)
-        self.soft = np.flatnonzero(self.clear)
-        looks = np.repeat([len(table.fraction) for table in tables], np.diff(self.ends))
-        self.gain = _column(tables, "gain", np.float32) / looks.astype(np.float32)
-        self._repeated: Array = self.gain[:0, None]
+        clear = _column(tables, "clear", np.float32)
+        self.soft = np.flatnonzero(clear)
+        self.clear, self.beneath = clear[self.soft], self.pixels[self.soft]
+        self.kept = sum(len(table.texels) for table in tables) <= KEPT
+        self._matrices: dict[type, list[Any]] = {}
 
     def paste(self, scene: Image, below: Image, out: Image) -> None:
         """Write the pixels of a frame. scene: the clear image. below: the frame's part of it. out: (H, W[, C])."""
-        if not self.ends[-1]:
+        if not self.tables:
             return
-        target = _flat(out)
-        total: Image = np.empty((self.ends[-1], target.shape[1]), dtype=SUMS[out.dtype.name])
-        scenes = [scene, halves(scene) if any(table.coarse for table in self.tables) else scene[:0]]
-        for table, first, last in zip(self.tables, self.ends[:-1], self.ends[1:], strict=True):
-            table.add(scenes[table.coarse], total[first:last])
-        gain = self._gain(target.shape[1])
-        shown: Image = cv2.multiply(total, gain, dtype=depth_of(out))
-        shown = shown.reshape(total.shape)
-        if self.soft.size:
-            mixed = total[self.soft] * gain[self.soft]
-            mixed += _flat(below)[self.pixels[self.soft]] * self.clear[self.soft, None]
-            if out.dtype.kind == "u":
-                np.clip(np.rint(mixed, out=mixed), 0, np.iinfo(out.dtype).max, out=mixed)
-            shown[self.soft] = mixed
-        words = np.dtype((np.void, target.itemsize * target.shape[1]))
-        np.put(target.view(words), self.pixels, shown.view(words))
+        target, levels = _flat(out), self._levels(scene)
+        clear = _taken(_flat(below), self.beneath)
+        shown: Image = np.empty((len(self.pixels), target.shape[1]), dtype=out.dtype)
+        if out.dtype == np.uint8:
+            for first in range(0, target.shape[1], PACKED):
+                part = slice(first, min(first + PACKED, target.shape[1]))
+                self._bytes([level[:, part] for level in levels], clear[:, part], shown[:, part])
+        else:
+            self._numbers(levels, clear, shown)
+        np.put(_as_one(target), self.pixels, _as_one(shown))
 
-    def _gain(self, channels: int) -> Array:
-        """The gain for every channel, (M, C), made for the first frame."""
-        if self._repeated.shape != (len(self.gain), channels):
-            self._repeated = np.repeat(self.gain[:, None], channels, axis=1)
-        return self._repeated
+    def _bytes(self, levels: list[Image], clear: Image, shown: Image) -> None:
+        """Sums of up to three channels of bytes."""
+        source: Any = np.empty(sum(len(level) for level in levels), dtype=np.uint64)
+        first = 0
+        for level in levels:
+            _pack(level, source[first : first + len(level)])
+            first += len(level)
+        beneath: Any = np.empty(len(clear), dtype=np.uint64)
+        _pack(clear, beneath)
+        beneath *= self._clear_units
+        for rows, soft, matrix in self._each(np.uint64, len(source)):
+            total = matrix @ source
+            total += self._roundings[rows]
+            total[self.soft[soft] - rows.start] += beneath[soft]
+            total >>= np.uint64(SHIFT)
+            over = total & np.uint64(OVER)  # bits that say a value is above 255: it becomes 255
+            total |= over - (over >> np.uint64(8))
+            _unpack(total, shown[rows])
+
+    def _numbers(self, levels: list[Image], clear: Image, shown: Image) -> None:
+        """Sums of anything else, in single precision."""
+        source = np.concatenate([clear[:0].astype(np.float32), *(level.astype(np.float32) for level in levels)])
+        for rows, soft, matrix in self._each(np.float32, len(source)):
+            total = matrix @ source
+            total *= np.float32(1 / UNIT)
+            total[self.soft[soft] - rows.start] += clear[soft] * self.clear[soft, None]
+            if shown.dtype.kind == "u":
+                np.clip(np.rint(total, out=total), 0, np.iinfo(shown.dtype).max, out=total)
+            shown[rows] = total
+
+    def _each(self, kind: type, columns: int) -> Iterator[tuple[slice, slice, Any]]:
+        """Of each piece its rows, those of `soft` in it, and its matrix."""
+        if self.kept and kind not in self._matrices:
+            self._matrices[kind] = [piece.matrix(self._number, kind, columns) for piece in self.pieces]
+        first = before = 0
+        for place, piece in enumerate(self.pieces):
+            last = first + piece.rows.stop - piece.rows.start
+            until = int(np.searchsorted(self.soft, last))
+            matrix = self._matrices[kind][place] if self.kept else piece.matrix(self._number, kind, columns)
+            yield slice(first, last), slice(before, until), matrix
+            first, before = last, until
+
+    # -- what is looked at ---------------------------------------------------------------------------------------------
+
+    def _levels(self, scene: Image) -> list[Image]:
+        """Of each level that is needed the texels, (N, C): all of them, or those that `_picked` names."""
+        found = []
+        for number, picked in enumerate(self._picked):
+            if number:
+                scene = half(scene)
+            flat = _flat(scene)
+            found.append(flat if picked is None else _taken(flat, picked))
+        return found
+
+    @cached_property
+    def _picked(self) -> list[Indices | None]:
+        """For each level up to the last one that is used, the texels that are; None: all."""
+        edges, used = starts(self.size), np.zeros(starts(self.size)[-1], dtype=np.bool_)
+        for table in self.tables:
+            used[table.texels] = True
+        found: list[Indices | None] = []
+        for first, last in pairwise(edges[: np.searchsorted(edges, used.nonzero()[0].max(initial=0), "right") + 1]):
+            some = np.flatnonzero(used[first:last])
+            found.append(some if some.size < SPARSE * (last - first) else None)
+        return found
+
+    @cached_property
+    def _number(self) -> Any:
+        """For each texel its number among those that are looked at; int32."""
+        edges = starts(self.size)
+        number, count = np.zeros(edges[-1], dtype=np.int32), 0
+        for level, picked in enumerate(self._picked):
+            place = number[edges[level] : edges[level + 1]]
+            size = len(place) if picked is None else len(picked)
+            place[slice(None) if picked is None else picked] = np.arange(count, count + size, dtype=np.int32)
+            count += size
+        return number
+
+    @cached_property
+    def _clear_units(self) -> Any:
+        return np.rint(self.clear * UNIT).astype(np.uint64)
+
+    @cached_property
+    def _roundings(self) -> Any:
+        """What is added to the words before they are cut off: a half, less what OpenCV has rounded up before."""
+        edges = starts(self.size)
+        level = np.repeat(np.arange(len(edges) - 1), np.diff(edges)).astype(np.uint8)
+        found = []
+        for table in self.tables:
+            ends = np.cumsum(table.counts)
+            so_far = np.concatenate([[0], np.cumsum(table.weights * level[table.texels].astype(np.int64))])
+            found.append(so_far[ends] - so_far[ends - table.counts])
+        shift = np.minimum(BIAS / UNIT * np.concatenate(found), DARKEST)
+        return np.floor((0.5 - shift) * UNIT).astype(np.uint64) * np.uint64(EVERY)
 
 
-SUMS = {"uint8": np.uint16, "uint16": np.float32, "float32": np.float32}  # of looks at images of a type
+def _pack(values: Image, words: Any) -> None:
+    """Write words, (N,), of up to three channels of bytes, (N, C)."""
+    for first in range(0, len(words), ROWS):  # few enough for the caches
+        some, channels = words[first : first + ROWS], values[first : first + ROWS]
+        some[...] = channels[:, -1]
+        for channel in range(channels.shape[1] - 2, -1, -1):
+            some <<= np.uint64(FIELD)
+            some |= channels[:, channel]
+
+
+def _unpack(words: Any, values: Image) -> None:
+    """The lowest bytes of the words' fields, (N, C)."""
+    for channel in range(values.shape[1]):
+        if channel:
+            words >>= np.uint64(FIELD)
+        values[:, channel] = words.view(np.uint8)[:: words.itemsize] if LITTLE else words & np.uint64(255)
+
+
+def _taken(values: Image, rows: Indices) -> Image:
+    """Rows of values, (N, C)."""
+    found: Image = np.take(_as_one(values), rows).view(values.dtype).reshape(len(rows), values.shape[1])
+    return found
+
+
+def _as_one(values: Image) -> Any:
+    """A view of rows, (N, C) contiguous, as (N, 1): all channels are moved at once."""
+    return values.view(np.dtype((np.void, values.itemsize * values.shape[1])))
 
 
 def _joined(same: Sequence[Lookups]) -> Lookups:
-    columns = [
-        np.concatenate([getattr(part, name) for part in same], axis=1 if name in WIDE else 0)
-        for name, _ in same[0]._columns()
-    ]
-    return Lookups(same[0].coarse, *columns)
+    return Lookups(*(np.concatenate([getattr(part, name) for part in same]) for name, _ in same[0].columns()))
 
 
 def _column(tables: Sequence[Lookups], name: str, dtype: Any) -> Any:
     return np.concatenate([np.zeros(0, dtype=dtype), *(getattr(table, name) for table in tables)])
-
-
-def _rows(values: Any, rows: int) -> Any:
-    """(n, m, ...) as (rows, ACROSS, ...), 0 at the end."""
-    count = values.shape[0] * values.shape[1]
-    if count == rows * ACROSS:
-        return np.ascontiguousarray(values).reshape(rows, ACROSS, *values.shape[2:])
-    padded = np.zeros((rows * ACROSS, *values.shape[2:]), dtype=values.dtype)
-    padded[:count] = values.reshape(-1, *values.shape[2:])
-    return padded.reshape(rows, ACROSS, *values.shape[2:])
 
 
 def _flat(image: Image) -> Image:

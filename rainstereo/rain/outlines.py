@@ -17,8 +17,8 @@ from rainstereo.types import Array, Indices
 
 from .contacts import clusters, touching
 
-AROUND = 24
-HEIGHTS = 3
+AROUND = 16
+HEIGHTS = 2
 MARGIN = 2.5
 """Pixels around a drop that are its own too: a ring without any of it, so that two groups share no pixel."""
 

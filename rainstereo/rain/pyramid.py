@@ -1,19 +1,23 @@
 """An image and its halves, for drops that show it small.
 
-The halves stand below one another in one image, so that one call to OpenCV looks at all of them.
+Level k holds means over squares of 2^k x 2^k pixels, so that four texels are one of the next level. Where a level's
+width or height is odd, its last column or row counts twice.
 """
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
-from rainstereo.types import Array, Image, Indices
+from rainstereo.scene_statistics import SceneStatistics
+from rainstereo.types import Array, Image
 
 SMALLEST = 4  # pixels along the shorter side
-INSIDE = 1 / 32
-"""Pixels between looks and the centres of the last row and column. OpenCV's remap, which steps by so much, takes thirty
-times as long for a place with a neighbour beyond the image."""
+BIAS = 0.125  # gray levels by which OpenCV's mean of four bytes is too large: it rounds halves up
+SHARP = 2  # level up to which a sharp image is as uneven as there
+ACROSS = 4  # points along a texel's side that stand for its area
 
 
 def sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
@@ -24,26 +28,36 @@ def sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
     return levels
 
 
-def halves(image: Image) -> Image:
-    """Area averages of an image, (H, W[, C]): half as large, a quarter, and so on, below one another."""
-    levels = sizes((image.shape[1], image.shape[0]))[1:]
-    if not levels:
-        return image[:0]
-    stack: Image = np.empty((sum(height for _, height in levels), levels[0][0], *image.shape[2:]), dtype=image.dtype)
-    above, top = image, 0
-    for width, height in levels:
-        place = stack[top : top + height, :width]
-        half = cv2.resize(above, (width, height), interpolation=cv2.INTER_AREA)
-        place[...] = half.reshape(place.shape)
-        above, top = half, top + height
-    return stack
-
-
-def in_level(source: Array, size: tuple[int, int], level: Indices) -> Array:
-    """Where pixels of the image, (..., 2) float32, are in levels, (...,), of the image (0) or of `halves`."""
-    levels: Array = np.array(sizes(size), dtype=np.float32)
-    scale, last = levels / levels[0], levels - 1 - INSIDE
-    found: Array = np.clip((source + np.float32(0.5)) * scale[level] - np.float32(0.5), 0, np.maximum(last, 0)[level])
-    tops = np.concatenate([[0, 0], np.cumsum(levels[1:, 1])[:-1]])[: len(levels)].astype(np.float32)
-    found[..., 1] += tops[level]
+def starts(size: tuple[int, int]) -> list[int]:
+    """Number of the first texel of each level, and of all, where texels are counted level by level, row by row."""
+    found = [0]
+    for width, height in sizes(size):
+        found.append(found[-1] + width * height)
     return found
+
+
+def half(image: Image) -> Image:
+    """Means over 2 x 2 pixels of an image, (H, W[, C]) uint8, uint16 or float32."""
+    height, width = image.shape[:2]
+    if height % 2 or width % 2:
+        image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE).reshape(
+            height + height % 2, width + width % 2, *image.shape[2:]
+        )
+    shape = (-(-height // 2), -(-width // 2))
+    found = cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA)
+    return found.reshape(*shape, *image.shape[2:])
+
+
+@cache
+def unevenness(count: int) -> Array:
+    """Expected square of half the difference of neighbouring texels, (count,) gray levels squared, level by level.
+
+    Of photographs (`SceneStatistics.natural`).
+    """
+    scene = SceneStatistics.natural()
+    along = (np.arange(ACROSS) + 0.5) / ACROSS
+    one = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)
+    weights = np.repeat([1.0, -1.0], ACROSS**2) / ACROSS**2
+    places = np.stack([np.concatenate([one, one + [1, 0]]) * 2**k for k in range(count)])
+    found = 0.5 * scene.variance(places, np.broadcast_to(weights, (count, len(weights))))
+    return np.maximum(found, found[min(SHARP, count - 1)])

@@ -26,6 +26,8 @@ from rainstereo.types import Array, Image, Indices, Mask
 from . import drop_list, linear_light
 from .blurred import BlurredLayer, by_disc
 from .drops import Drops
+from .glance import Glance
+from .looks import Looks, PasteLooks
 from .lookups import Lookups, Paste
 from .minified import Batch, Minifier
 from .outlines import Outlines
@@ -79,6 +81,8 @@ class Renderer:
     look a pixel, and hard edges, which is the fastest.
     border: what lies beyond the image: "mirror", "edge", or a `Surround` of it, beyond which it is mirrored.
     linear_light: whether values are sRGB and light is to be averaged, not values.
+    moving: whether most drops move from frame to frame: plans of caps on one far face are made some fifty times as
+    fast, frames drawn in about twice the time, and pixels in drops off by 4 gray levels or so (`glance`).
     """
 
     camera: Camera
@@ -88,6 +92,7 @@ class Renderer:
     tolerance: float = 1.0
     border: str | Surround = "mirror"
     linear_light: bool = False
+    moving: bool = False
 
     def __post_init__(self) -> None:
         if not self.tolerance > 0:
@@ -132,11 +137,20 @@ class Renderer:
         outlines = Outlines.of(drops, self.camera, self.chamber)
         return [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in outlines.groups()]
 
-    def lookups(self, groups: Sequence[Group], numbers: Iterable[int]) -> list[Lookups]:
+    def lookups(self, groups: Sequence[Group], numbers: Iterable[int]) -> list[Any]:
         """What pixels look at in groups of drops, which get these numbers."""
         if not groups:
             return []
-        return self._minifier.lookups(self._batches(groups, np.fromiter(numbers, dtype=np.intp)))
+        given = np.fromiter(numbers, dtype=np.intp)
+        if not self.moving:
+            return self._minifier.lookups(self._batches(groups, given))
+        caps = [drop for group in groups for drop in group.drops if isinstance(drop, SphericalCap)]
+        places = {(cap.panel, cap.face) for cap in caps}
+        if len(caps) < sum(len(group.drops) for group in groups) or len(places) > 1 or caps[0].face != "far":
+            return self._glance.tables(self._batches(groups, given))
+        pixels, which = Outlines.joined([group.outlines for group in groups]).pixels()
+        of_drop = np.repeat(given, [len(group.drops) for group in groups])
+        return self._glance.tables_of_caps(caps, pixels, which, of_drop[which])
 
     def _batches(self, groups: Sequence[Group], numbers: Indices) -> list[Batch]:
         """Caps of a face in one batch if each is alone, in another if not; groups with other drops on their own."""
@@ -152,6 +166,10 @@ class Renderer:
         return Minifier(
             self.camera, self.chamber, self.depth, self.tolerance, self.scene_size, self.shift, self.fold
         )  # fmt: skip
+
+    @cached_property
+    def _glance(self) -> Glance:
+        return Glance(self._minifier)
 
     # -- the image that holds the scene --------------------------------------------------------------------------------
 
@@ -193,6 +211,7 @@ class Renderer:
         return {
             "camera": self.camera, "chamber": self.chamber, "depth": float(self.depth), "lens": self.lens,
             "tolerance": float(self.tolerance), "border": sides, "linear_light": self.linear_light,
+            "moving": self.moving,
         }  # fmt: skip
 
     @classmethod
@@ -217,7 +236,7 @@ class Plan:
 
     renderer: Renderer
     drops: Sequence[Drop]
-    tables: Sequence[Lookups] = field(repr=False)
+    tables: Sequence[Lookups] | Sequence[Looks] = field(repr=False)
     layers: Sequence[BlurredLayer] = field(repr=False)
 
     def apply(self, image: Image) -> Image:
@@ -240,8 +259,10 @@ class Plan:
             layer.paste(scene, out)
 
     @cached_property
-    def _paste_all(self) -> Paste:
-        return Paste(self.tables)
+    def _paste_all(self) -> Paste | PasteLooks:
+        if self.renderer.moving:
+            return PasteLooks([table for table in self.tables if isinstance(table, Looks)])
+        return Paste([table for table in self.tables if isinstance(table, Lookups)], self.renderer.scene_size)
 
     def _in_light(self, image: Image, out: Image) -> None:
         """The same, averaging light; only pixels that drops touch are converted back."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence as Row
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from rainstereo.types import Array
 
 from .blurred import BlurredLayer
 from .drops import Drops
-from .lookups import Lookups
 from .metaballs import STEEPEST, bodies, merge
 from .motion import Motion, PaneState
 from .render import AnyDrops, Key, Plan, Renderer, shapes
@@ -25,7 +25,7 @@ class _Generation:
     """Tables of groups that were traced in one frame, or of what is left of them."""
 
     groups: frozenset[int]
-    tables: list[Lookups]
+    tables: list[Any]
 
     def only(self, groups: set[int]) -> _Generation:
         kept = self.groups & groups
@@ -68,7 +68,7 @@ class Sequence:
         self._last = Plan(self.renderer, everyone, tuple(self._tables(sharp)), tuple(layers))
         return self._last
 
-    def _tables(self, sharp: Row[Drop]) -> list[Lookups]:
+    def _tables(self, sharp: Row[Drop]) -> list[Any]:
         """Tables of the groups of sharp drops; only new groups are traced."""
         groups = self.renderer.groups(sharp)
         keys = [group.key for group in groups]
@@ -84,7 +84,8 @@ class Sequence:
             kept.append(_Generation(frozenset(fresh), self.renderer.lookups(new, fresh)))
         if len(kept) > MOST_GENERATIONS:  # the first is the largest, and stays
             late = kept[1:]
-            tables = Lookups.joined([table for generation in late for table in generation.tables])
+            tables = [table for generation in late for table in generation.tables]
+            tables = type(tables[0]).joined(tables) if tables else tables
             kept = [kept[0], _Generation(frozenset().union(*(generation.groups for generation in late)), tables)]
         self._generations = kept
         return [table for generation in kept for table in generation.tables]
@@ -114,6 +115,11 @@ class PaneShapes:
         return found
 
 
+def joined_shapes(drops: Drops) -> list[Drop]:
+    """Shapes of drops of which those that touch are one body, of their volume. Drops too steep to merge stay caps."""
+    return [shape for members in _members(drops) for shape in _body(members)]
+
+
 def _members(drops: Drops) -> list[Drops]:
     """The drops of each body."""
     steep = drops.contact_angle > STEEPEST
@@ -132,4 +138,4 @@ def _bytes(*columns: Array) -> bytes:
     return b"".join(column.tobytes() for column in columns)
 
 
-__all__ = ["PaneShapes", "Sequence"]
+__all__ = ["PaneShapes", "Sequence", "joined_shapes"]

@@ -24,6 +24,7 @@ from rainstereo.apps.cli import main
 from rainstereo.apps.rain_motion import Drive, Sequence
 from rainstereo.apps.rain_presets import PRESETS
 from rainstereo.apps.rain_settings import Rain
+from rainstereo.height_map import HeightMap
 from rainstereo.rain.render import Renderer
 from rainstereo.types import Image
 
@@ -116,6 +117,24 @@ def test_the_drop_list_makes_the_frame_again(clear: Path, rainy: Path, tmp_path:
     assert np.array_equal(renderer.plan(drops).apply(imagefile.read(clear / "002.png")), expected)
     assert rain(clear / "002.png", tmp_path / "again", "--drops", str(listed), "--no-drop-lists") == 0
     assert contents(tmp_path / "again") == {"002.png": (rainy / "002.png").read_bytes()}
+
+
+def test_drops_that_touch_become_bodies_of_their_volume() -> None:
+    """--merge, and the drop list makes the frame again, bodies and all."""
+    setup = replace(PRESETS["drops"], population=PRESETS["drops"].population.with_cover(0.3), f_number=math.inf)
+    merged = Rain(setup, tolerance=20, merge=True)
+    drops = merged.in_sight(merged.drops("a", SIZE), SIZE)
+    shapes = list(merged.standing(drops, "a", SIZE))
+    bodies = [shape for shape in shapes if isinstance(shape, HeightMap)]
+    assert bodies
+    assert len(shapes) < len(drops)
+    assert sum(shape.volume for shape in shapes) == pytest.approx(drops.volume.sum(), rel=0.01)
+    image = picture(3)
+    plan, _ = merged.plan(image, "a")
+    found = plan.render(image)
+    again, listed = Renderer.from_json(found.drops_json())
+    np.testing.assert_array_equal(again.plan(listed).apply(image), found.image)
+    assert (found.image != Rain(setup, tolerance=20).plan(image, "a")[0].apply(image)).any()
 
 
 def test_every_image_has_drops_of_its_own_that_its_name_decides(clear: Path, rainy: Path, tmp_path: Path) -> None:

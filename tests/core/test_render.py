@@ -19,7 +19,7 @@ from rainstereo.rain import drop_list
 from rainstereo.rain.drops import Drops
 from rainstereo.rain.linear_light import decoded, encoded
 from rainstereo.rain.metaballs import merge
-from rainstereo.rain.pyramid import halves, sizes
+from rainstereo.rain.pyramid import half, sizes, starts
 from rainstereo.rain.render import Renderer, Surround, shapes
 from rainstereo.rain.streaks import Streak
 from rainstereo.thin_lens import ThinLens
@@ -55,13 +55,18 @@ def look_up(image: np.ndarray, places: np.ndarray) -> np.ndarray:
 def brute_force(
     image: np.ndarray, drops: list[Drop], camera: Camera, chamber: Chamber, depth: float, side: int = 8
 ) -> tuple[np.ndarray, np.ndarray]:
-    """side x side exact rays of every pixel, and the share of them that meet a drop."""
+    """side x side exact rays of every pixel near a drop, and the share of them that meet a drop."""
     width, height = camera.size
-    own = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height)), -1).reshape(-1, 2)
+    every = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height)), -1)
+    near = np.zeros((height, width), dtype=np.uint8)
+    for corner in ([0, 0], [-0.49, -0.49], [-0.49, 0.49], [0.49, -0.49], [0.49, 0.49]):
+        near |= trace(every + corner, drops, camera, chamber, depth).status != Fate.NO_DROP
+    near = cv2.dilate(near, np.ones((3, 3), np.uint8)) > 0
+    own = every[near]
     along = (np.arange(side) + 0.5) / side - 0.5
     total, covered = np.zeros((len(own), 3)), np.zeros(len(own))
     clear = clear_transmittance(own, camera, chamber)
-    flat = image.reshape(-1, 3).astype(float)
+    flat = image[near].astype(float)
     for dy in along:
         for dx in along:
             seen = trace(own + [dx, dy], drops, camera, chamber, depth)
@@ -71,9 +76,11 @@ def brute_force(
             total[beside] += flat[beside]
             total[lit] += (look_up(image, seen.source[lit]) * gain[lit, None]).reshape(-1, 3)
             covered += ~beside
+    found, share = image.astype(float), np.zeros((height, width))
     # a drop can be brighter than the bare panel: water reflects less
-    found = np.clip(total / side**2, 0, 255).reshape(height, width, 3)
-    return found, (covered / side**2).reshape(height, width)
+    found[near] = np.clip(total / side**2, 0, 255)
+    share[near] = covered / side**2
+    return found, share
 
 
 def rms(difference: np.ndarray) -> float:
@@ -92,10 +99,11 @@ SCENES: dict[str, tuple[Chamber, list[Drop]]] = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_within_a_gray_level_of_64_rays_a_pixel(name):
+def test_within_a_gray_level_of_576_rays_a_pixel(name):
+    """64 are themselves wrong by 0.6 to 0.8 gray levels here."""
     chamber, drops = SCENES[name]
     image = photograph()
-    expected, covered = brute_force(image, drops, CAMERA, chamber, DEPTH)
+    expected, covered = brute_force(image, drops, CAMERA, chamber, DEPTH, 24)
     found = Renderer(CAMERA, chamber, DEPTH).plan(drops).render(image)
     inside = covered > 0
     assert np.count_nonzero(inside) > 600
@@ -106,21 +114,37 @@ def test_within_a_gray_level_of_64_rays_a_pixel(name):
 
 def test_tolerance_trades_looks_for_error():
     image, drops = photograph(), SCENES["lone"][1]
-    expected, covered = brute_force(image, drops, CAMERA, PANE, DEPTH)
+    expected, covered = brute_force(image, drops, CAMERA, PANE, DEPTH, 24)
     errors, looks = [], []
     for tolerance in (1.0, 4.0, 16.0, math.inf):
         plan = Renderer(CAMERA, PANE, DEPTH, tolerance=tolerance).plan(drops)
         errors.append(rms((plan.apply(image) - expected)[covered > 0]))
-        looks.append(sum(table.fraction.size for table in plan.tables))
+        looks.append(sum(len(table.texels) for table in plan.tables))
     assert errors == sorted(errors)
     assert looks == sorted(looks, reverse=True)
     for error, tolerance in zip(errors, (1.0, 4.0, 16.0), strict=False):
         assert error <= tolerance
 
 
+@pytest.mark.parametrize("name", SCENES)
+def test_a_glance_at_moving_drops(name):
+    chamber, drops = SCENES[name]
+    image = photograph()
+    careful = Renderer(CAMERA, chamber, DEPTH).plan(drops).render(image)
+    quick = Renderer(CAMERA, chamber, DEPTH, moving=True).plan(drops).render(image)
+    inside = careful.opacity > 0
+    assert rms((quick.image.astype(float) - careful.image)[inside]) <= 8.0
+    assert rms(quick.opacity - careful.opacity) <= 0.02
+    np.testing.assert_array_equal(quick.image[~quick.drop_mask], image[~quick.drop_mask])
+    both = np.isfinite(quick.displacement).all(-1) & np.isfinite(careful.displacement).all(-1) & (quick.opacity == 1)
+    assert np.median(np.abs(quick.displacement - careful.displacement)[both & inside]) < 1.0
+    assert (quick.unknown != careful.unknown)[inside].mean() < 0.05
+
+
+@pytest.mark.parametrize("moving", [False, True])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("channels", [0, 1, 3, 4])
-def test_types_and_channels(dtype, channels):
+def test_types_and_channels(dtype, channels, moving):
     gray = photograph()[..., 1]
     drops = SCENES["lone"][1]
     image = gray if channels == 0 else np.stack([gray] * channels, -1)
@@ -132,7 +156,7 @@ def test_types_and_channels(dtype, channels):
         else image
     )
     before = image.copy()
-    plan = Renderer(CAMERA, PANE, DEPTH).plan(drops)
+    plan = Renderer(CAMERA, PANE, DEPTH, moving=moving).plan(drops)
     found = plan.render(image)
     np.testing.assert_array_equal(image, before)
     assert found.image.dtype == dtype
@@ -143,7 +167,7 @@ def test_types_and_channels(dtype, channels):
     of_bytes = plan.apply(gray)
     one = found.image if channels == 0 else found.image[..., -1]
     # interpolation and rounding differ
-    assert np.abs(one / scale - of_bytes).max() <= 1.01
+    assert np.abs(one / scale - of_bytes).max() <= (2.01 if moving else 1.01)
 
 
 def test_views_are_read_where_they_are():
@@ -215,7 +239,7 @@ def test_a_wider_image_shows_what_mirrors_make_up():
     assert found.unknown.sum() < mirrored.unknown.sum()
     shifted = Camera.pinhole(800, 800, 299.5, 229.5, 700, 500)
     moved = [cap(5, 3, 1.2, 25), cap(-9, -5, 1.5, 30)]
-    expected, covered = brute_force(wide, moved, shifted, PANE, DEPTH, 8)
+    expected, covered = brute_force(wide, moved, shifted, PANE, DEPTH, 24)
     part = (slice(80, 380), slice(100, 500))
     assert rms((found.image - expected[part])[covered[part] > 0]) <= 1.0
     edge = Renderer(CAMERA, PANE, DEPTH, border="edge").plan(drops).render(frame)
@@ -296,13 +320,13 @@ def test_lens_against_the_aperture():
     np.testing.assert_array_equal(blurred.opacity, found.opacity)
 
 
-def test_halves_stand_below_one_another():
+def test_halves_are_means():
     image = photograph(101, 60)
-    stack, levels = halves(image), sizes((101, 60))
-    assert levels[1] == (51, 30)
-    assert stack.shape[:2] == (sum(h for _, h in levels[1:]), 51)
-    assert rms(stack[:30].mean((0, 1)) - image.mean((0, 1))) < 1
-    np.testing.assert_array_equal(stack[:30], cv2.resize(image, (51, 30), interpolation=cv2.INTER_AREA))
+    level, levels = half(image), sizes((101, 60))
+    assert level.shape[1::-1] == levels[1] == (51, 30)
+    padded = np.concatenate([image, image[:, -1:]], 1).reshape(30, 2, 51, 2, 3).mean((1, 3))
+    assert np.abs(level - padded).max() <= 0.5
+    assert starts((101, 60))[:3] == [0, 6060, 6060 + 1530]
 
 
 caps = st.lists(

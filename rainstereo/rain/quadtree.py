@@ -1,0 +1,332 @@
+"""Which texels of an image and its halves make up a pixel that looks at the scene along many rays.
+
+A drop shows the scene small: the rays of one pixel may spread over fifty pixels of it. Their sum is written as a
+weighted sum of texels, as few as an error allows. Every ray's share goes to the four texels around it, in the finest
+level that holds all of the pixel's rays in a window; then, level by level, four texels become one of the next coarser
+level wherever that costs little: replacing weights w_i by their mean changes the pixel by sum (w_i - mean) I_i, whose
+expected square is about |w - mean|^2 times the `unevenness` of the level. Merging is worth `worth` of square error for
+each texel that it saves, which makes the fewest texels for the error that is left (J. M. Shapiro's trees of wavelet
+coefficients, "Embedded image coding using zerotrees", IEEE TSP 41, 1993, with weights in place of an image).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from rainstereo.types import Array, Image, Indices, Mask
+
+from .pyramid import sizes, starts, unevenness
+
+Steps = tuple[Array, Array, Array, Array]
+
+LOOSE = 2.5
+"""Times the usual step between its rays, all along it, that a pixel's rays may span as one."""
+MERGES = 3
+ALIGNED = 1 << MERGES
+UNIT = 4096
+"""Of weights: whole numbers, so that three channels of a sum fit into one word (see `lookups`)."""
+FEW, DEAR = 2, 2.0
+"""Levels with so many texels that making them ready for sums costs as well, and what a tap of these counts for."""
+FINE = 1 << 24
+CELLS = 1 << 18  # of windows that are held at once
+
+
+@dataclass(frozen=True, eq=False)
+class Taps:
+    """Texels of pixels, by rows. texels, weights: (T,) int32, uint16 in `UNIT`ths. counts: (M,) of each pixel.
+
+    error: (M,) expected square of what merging changed, gray levels.
+    """
+
+    texels: Any
+    weights: Any
+    counts: Any
+    error: Array
+
+
+@dataclass(frozen=True)
+class Quadtree:
+    """size: (width, height) of the image. extent: texels that a pixel's rays may span. worth: gray levels squared."""
+
+    size: tuple[int, int]
+    extent: int
+    worth: float
+
+    def taps(self, x: Array, y: Array, weights: Array) -> Taps:
+        """Texels of M pixels for rays at x, y, (K, M) float32 each, in the image, K a square, of weights (K, M)."""
+        side = -(-(self.extent + ALIGNED) // ALIGNED) * ALIGNED
+        step = max(1, CELLS // side**2)
+        parts = [
+            self._some(x[:, i : i + step], y[:, i : i + step], weights[:, i : i + step], side)
+            for i in range(0, max(weights.shape[1], 1), step)
+        ]
+        return Taps(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("texels", "weights", "counts", "error")))
+
+    def _some(self, x: Array, y: Array, weights: Array, side: int) -> Taps:
+        steps = steps_between(x, y, weights)
+        span = _span(x, y, weights)
+        loose = self._is_loose(span, steps, weights)
+        if loose.any():
+            tight = np.flatnonzero(~loose)
+            rays = [columns[:, tight] for columns in (x, y, weights)]
+            one = self._together(rays[0], rays[1], rays[2], _of(steps, tight), span[tight], side)
+            apart = np.flatnonzero(loose)
+            rays = [columns[:, apart] for columns in (x, y, weights)]
+            return _mixed(loose, one, self._apart(rays[0], rays[1], rays[2], _of(steps, apart)))
+        return self._together(x, y, weights, steps, span, side)
+
+    def _is_loose(self, span: Array, steps: Steps, weights: Array) -> Mask:
+        """Which pixels see several places far apart, (M,): a window for all of them would be too coarse."""
+        along = math.isqrt(len(weights))
+        length = np.maximum(np.abs(steps[0]) + np.abs(steps[2]), np.abs(steps[1]) + np.abs(steps[3]))
+        length[weights == 0] = np.inf
+        length.sort(axis=0)
+        middle = np.count_nonzero(weights, axis=0) // 2
+        usual = length[np.minimum(middle, len(length) - 1), np.arange(len(middle))]
+        return np.asarray((span > LOOSE * (1 + along * usual)) & (middle > 0))
+
+    def _apart(self, x: Array, y: Array, weights: Array, steps: Steps) -> Taps:
+        """A texel for each ray, about as large as the ray's part of the scene."""
+        count, most = weights.shape[1], len(sizes(self.size)) - 1
+        size = np.sqrt(np.abs(steps[0] * steps[3] - steps[1] * steps[2]) + np.float32(1e-6))
+        level = np.clip(np.floor(np.log2(size) + np.float32(0.5)), 0, most).astype(np.intp)
+        pixel, ray = np.nonzero((weights > 0).T)
+        level = level[ray, pixel]
+        wide, high = (np.array([each[i] for each in sizes(self.size)]) for i in (0, 1))
+        j, i = (
+            np.minimum(((at[ray, pixel] + 0.5) * np.exp2(-level)).astype(np.intp), last[level] - 1)
+            for at, last in ((x, wide), (y, high))
+        )
+        texel = np.array(starts(self.size))[level] + i * wide[level] + j
+        return _whole(pixel, texel, weights[ray, pixel], count, np.zeros(count))
+
+    def _together(self, x: Array, y: Array, weights: Array, steps: Steps, span: Array, side: int) -> Taps:
+        count = weights.shape[1]
+        level, column, row = self._window(x, y, weights, span)
+        scale = np.exp2(-level.astype(np.float32))
+        own = [
+            (at + np.float32(0.5)) * scale - (first + 0.5).astype(np.float32) for at, first in ((x, column), (y, row))
+        ]
+        cells: Image = np.zeros((count, side * side), dtype=np.float32)
+        for fine in (True, False):
+            some = np.flatnonzero((level == 0) == fine)
+            if some.size:
+                few = slice(None) if some.size == count else some
+                u, v, share = (columns[:, few] for columns in (*own, weights))
+                if fine:
+                    cells[few] = _around(u, v, share, side)
+                else:
+                    cells[few] = _inside(u, v, share, [step[:, few] * scale[few] for step in steps], side)
+        uneven, error, found = unevenness(len(sizes(self.size))), np.zeros(count), []
+        closed: Mask = np.zeros(cells.shape, dtype=np.bool_)
+        for merge in range(MERGES + 1):
+            kept = cells
+            if merge < MERGES:
+                cells, kept, lost, closed = self._merge(cells, closed, uneven, level + merge)
+                error += lost
+            at = np.flatnonzero(kept)
+            pixel, cell = np.divmod(at, kept.shape[1])
+            place = self._place(cell, merge, side, level[pixel] + merge, column[pixel], row[pixel])
+            found.append((pixel, *place, kept.ravel()[at]))
+        order = np.argsort(np.concatenate([each[0] for each in found]), kind="stable")
+        pixel, of_level, i, j, weight = (np.concatenate(parts)[order] for parts in zip(*found, strict=True))
+        wide = np.array([size[0] for size in sizes(self.size)])
+        texel = np.array(starts(self.size))[of_level] + i * wide[of_level] + j
+        return _whole(pixel, texel, weight, count, error)
+
+    def _place(
+        self, cell: Indices, merge: int, side: int, level: Indices, column: Indices, row: Indices
+    ) -> tuple[Indices, Indices, Indices]:
+        """Level, row and column of the texels that cells of windows are, after so many merges."""
+        wide, high = (np.array([size[i] for size in sizes(self.size)]) for i in (0, 1))
+        x, y = (at[cell] for at in _places(side)[merge])
+        return (
+            level,
+            np.minimum(y + (row >> merge), high[level] - 1),
+            np.minimum(x + (column >> merge), wide[level] - 1),
+        )
+
+    def _window(self, x: Array, y: Array, weights: Array, span: Array) -> tuple[Indices, Indices, Indices]:
+        """Of each pixel the level, and the first column and row of a window of it that holds the rays."""
+        low = [_ends(at, weights)[0] for at in (x, y)]
+        level = np.ceil(np.log2(np.maximum(span / (self.extent - 1), 1e-6)) - 1e-6)
+        level = np.clip(level, 0, len(sizes(self.size)) - 1).astype(np.intp)
+        scale = np.exp2(-level.astype(np.float32))
+        first = [np.floor((at + np.float32(0.5)) * scale - np.float32(0.5)).astype(np.intp) for at in low]
+        column, row = (np.maximum(at, 0) & -ALIGNED for at in first)
+        return level, column, row
+
+    def _merge(self, cells: Array, closed: Mask, uneven: Array, level: Indices) -> tuple[Array, Array, Array, Mask]:
+        """Cells of the next level, (M, s / 4), what stays on this one, the square error, cells not to be merged."""
+        count = len(cells)
+        shape = (count, 4, cells.shape[1] // 4)
+        family, shut = cells.reshape(shape), closed.reshape(shape).any(1)
+        a, b, c, d = family.swapaxes(0, 1)
+        total = (a + b) + (c + d)
+        lost = (a * a + b * b) + (c * c + d * d) - np.float32(0.25) * (total * total)
+        lost *= uneven[np.minimum(level, len(uneven) - 1)].astype(np.float32)[:, None]
+        np.maximum(lost, 0, out=lost)
+        spared = (a > 0).view(np.int8) + (b > 0).view(np.int8) + (c > 0).view(np.int8) + (d > 0).view(np.int8)
+        spared -= 1
+        worth = np.where(level < FEW, np.float32(DEAR * self.worth), np.float32(self.worth))
+        gone = (lost <= worth[:, None] * spared) & (total > 0) & ~shut
+        gone &= (level + 1 < len(uneven))[:, None]
+        kept = np.where(gone[:, None], np.float32(0), family).reshape(cells.shape)
+        merged = np.where(gone, total, np.float32(0))
+        error = np.where(gone, lost, np.float32(0)).sum(1, dtype=np.float64)
+        return merged, kept, error, shut | (~gone & (total > 0))
+
+
+@cache
+def _order(side: int) -> Any:
+    """Number, (side^2,) int32, of each cell of a window, row by row: cells that merge are far apart.
+
+    The lowest bits of column and row come first, then the next, and what is left of them last.
+    """
+    row, column = np.divmod(np.arange(side * side), side)
+    number, left = np.zeros(side * side, dtype=np.intp), side * side
+    for bit in range(MERGES):
+        left //= 4
+        number += left * (2 * ((row >> bit) & 1) + ((column >> bit) & 1))
+    number += (row >> MERGES) * (side >> MERGES) + (column >> MERGES)
+    return number.astype(np.int32)
+
+
+@cache
+def _places(side: int) -> list[tuple[Any, Any]]:
+    """Column and row of each cell by its number, after 0, 1, ... merges."""
+    found = []
+    for merge in range(MERGES + 1):
+        cells = _order(side).astype(np.intp).reshape(side, side)[:: 1 << merge, :: 1 << merge]
+        by_number = np.argsort(cells, axis=None)
+        row, column = np.divmod(by_number, side >> merge)
+        found.append((column, row))
+    return found
+
+
+def _around(x: Array, y: Array, weights: Array, side: int) -> Array:
+    """Weights of the cells of windows, (M, side^2): each ray's share to the four around it, as it is looked up."""
+    x, y = np.clip(x, 0, side - 1), np.clip(y, 0, side - 1)
+    j, i = (np.minimum(at.astype(np.int32), side - 2) for at in (x, y))
+    u, v = x - j, y - i
+    cell, first = i * np.int32(side) + j, _firsts(weights, side)
+    shares = [(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v]
+    cells = np.concatenate([(_order(side)[cell + offset] + first).ravel() for offset in (0, 1, side, side + 1)])
+    return _counted(cells, np.concatenate([(share * weights).ravel() for share in shares]), side, weights.shape[1])
+
+
+def _inside(x: Array, y: Array, weights: Array, steps: Sequence[Array], side: int) -> Array:
+    """Weights of the cells of windows, (M, side^2): a ray stands for a parallelogram, four points of it for that.
+
+    Each point's share goes to the texel that it is in.
+    """
+    first, last = _firsts(weights, side), np.float32(side - 0.5)
+    cells: Indices = np.empty((4, *weights.shape), dtype=np.intp)
+    for number, (a, b) in enumerate(((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))):
+        j, i = (
+            np.clip(at + np.float32(a) * across + np.float32(b) * along + np.float32(0.5), 0, last).astype(np.int32)
+            for at, across, along in zip((x, y), steps[:2], steps[2:], strict=True)
+        )
+        i *= np.int32(side)
+        i += j
+        np.add(_order(side)[i], first, out=cells[number])
+    share = np.broadcast_to(np.float32(0.25) * weights, cells.shape)
+    return _counted(cells.ravel(), share.ravel(), side, weights.shape[1])
+
+
+def _firsts(weights: Array, side: int) -> Any:
+    return np.arange(weights.shape[1], dtype=np.int32) * np.int32(side * side)
+
+
+def _counted(cells: Indices, shares: Array, side: int, count: int) -> Array:
+    total = np.bincount(cells, shares, count * side * side)
+    found: Image = total.astype(np.float32).reshape(count, side * side)
+    return found
+
+
+def _ends(at: Array, weights: Array) -> tuple[Array, Array]:
+    """The least and the largest of the lit rays' coordinates, (M,); 0 where none is lit."""
+    away = np.where(weights > 0, np.float32(0), np.float32(np.inf))
+    low, high = (at + away).min(0), (at - away).max(0)
+    dark = np.isinf(low)
+    low[dark] = high[dark] = 0
+    return low, high
+
+
+def _span(x: Array, y: Array, weights: Array) -> Array:
+    """Sides, (M,) pixels, of the squares that hold the lit rays."""
+    (left, right), (top, bottom) = (_ends(at, weights) for at in (x, y))
+    return np.maximum(right - left, bottom - top)
+
+
+def _of(steps: Steps, some: Indices) -> Steps:
+    """Steps of some pixels."""
+    a, b, c, d = (step[:, some] for step in steps)
+    return a, b, c, d
+
+
+def _mixed(second: Mask, one: Taps, other: Taps) -> Taps:
+    """Taps of all pixels: the others are those of `second`."""
+    counts: Indices = np.empty(len(second), dtype=np.intp)
+    error: Array = np.empty(len(second))
+    counts[~second], counts[second] = one.counts, other.counts
+    error[~second], error[second] = one.error, other.error
+    from_second = np.repeat(second, counts)
+    found = []
+    for name in ("texels", "weights"):
+        a, b = getattr(one, name), getattr(other, name)
+        both: Any = np.empty(len(from_second), dtype=a.dtype)
+        both[~from_second], both[from_second] = a, b
+        found.append(both)
+    return Taps(found[0], found[1], counts, error)
+
+
+def steps_between(x: Array, y: Array, weights: Array) -> Steps:
+    """From each ray, (K, M), to its right neighbour, x and y, and its lower one: the shorter of both sides' steps."""
+    side, far = math.isqrt(len(x)), np.float32(np.inf)
+    shape = (side, side, weights.shape[1])
+    dark = np.where(weights > 0, np.float32(0), far).reshape(shape)
+    found = []
+    for axis in (1, 0):
+        low = tuple(slice(None, -1) if n == axis else slice(None) for n in range(3))
+        high = tuple(slice(1, None) if n == axis else slice(None) for n in range(3))
+        steps = [at.reshape(shape)[high] - at.reshape(shape)[low] for at in (x, y)]
+        length = np.abs(steps[0]) + np.abs(steps[1]) + dark[high] + dark[low]
+        before = np.full(shape, far, dtype=np.float32)
+        before[high] = length
+        closer = before[low] < length  # is the one before, for all rays but the last
+        lone = np.isinf(before)
+        lone[low] &= np.isinf(length)
+        for step in steps:
+            column: Image = np.empty(shape, dtype=np.float32)
+            column[high] = step
+            column[tuple(slice(0, 1) if n == axis else slice(None) for n in range(3))] = 0
+            column[low] = np.where(closer, column[low], step)
+            column[lone] = 0
+            found.append(column.reshape(x.shape))
+    return found[0], found[1], found[2], found[3]
+
+
+def _whole(pixel: Indices, texel: Indices, weight: Array, count: int, error: Array) -> Taps:
+    """Weights rounded so that each pixel's sum is, in `UNIT`ths, as near as it can be; those of 0 are left out.
+
+    What one tap is rounded by is made good by the next: sums so far are rounded, in whole numbers, exactly.
+    """
+    fine = np.rint(weight.astype(np.float64) * FINE).astype(np.int64)
+    so_far = np.cumsum(fine)
+    ends = np.cumsum(np.bincount(pixel, minlength=count))
+    before = np.concatenate([[0], so_far])[np.concatenate([[0], ends[:-1]])]
+    rounded = ((so_far - before[pixel]) * UNIT + FINE // 2) // FINE
+    steps = np.diff(rounded, prepend=0)
+    first = np.flatnonzero(np.diff(pixel, prepend=-1))
+    steps[first] = rounded[first]
+    keep = steps > 0
+    return Taps(
+        texel[keep].astype(np.int32), steps[keep].astype(np.uint16), np.bincount(pixel[keep], minlength=count), error
+    )

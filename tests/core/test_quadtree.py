@@ -1,0 +1,126 @@
+"""Texels that stand for a pixel's rays: against the rays themselves, looked up one by one."""
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage import data
+
+from rainstereo.rain.pyramid import half, sizes, starts
+from rainstereo.rain.quadtree import UNIT, Quadtree, Taps
+
+SIZE = (200, 150)
+SIDE = 8
+
+
+def photograph() -> np.ndarray:
+    return np.asarray(cv2.resize(data.astronaut(), SIZE, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def texels(image: np.ndarray) -> np.ndarray:
+    levels = [image]
+    for _ in sizes(SIZE)[1:]:
+        levels.append(half(levels[-1]))
+    return np.concatenate([level.reshape(-1, 3) for level in levels])
+
+
+def summed(taps: Taps, image: np.ndarray) -> np.ndarray:
+    """Values, (M, 3), one tap after the other."""
+    values = taps.weights[:, None] / UNIT * texels(image)[taps.texels]
+    total = np.zeros((len(taps.counts), 3))
+    np.add.at(total, np.repeat(np.arange(len(taps.counts)), taps.counts), values)
+    return total
+
+
+def spread(centre: np.ndarray, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x and y, (64, M), of rays evenly over parallelograms about places (M, 2)."""
+    along = ((np.arange(SIDE) + 0.5) / SIDE - 0.5).astype(np.float32)
+    a, b = (n.reshape(-1, 1, 1) for n in np.meshgrid(along, along))
+    at = np.clip(centre + a * right + b * down, 0, np.array(SIZE) - 1).astype(np.float32)
+    return np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
+
+
+def pixels(seed: int, count: int, widest: float) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform([30, 30], [170, 120], (count, 2))
+    return spread(centre, *rng.uniform(-widest, widest, (2, count, 2)))
+
+
+def looked_up(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR).mean(0))
+
+
+def test_small_pixels_are_their_rays():
+    """In the image itself each ray has its four texels: nothing but rounding is lost."""
+    x, y = pixels(1, 50, 5)
+    taps = Quadtree(SIZE, 33, 0.0).taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
+    image = photograph()
+    # OpenCV looks at steps of 1/32 pixel; weights are rounded to 1/4096
+    np.testing.assert_allclose(summed(taps, image), looked_up(image, x, y), atol=0.7)
+    assert not taps.error.any()
+
+
+def test_worth_trades_texels_for_error():
+    x, y = pixels(2, 300, 40)
+    share, image = np.full(x.shape, 1 / SIDE**2, dtype=np.float32), photograph()
+    counts, errors, told = [], [], []
+    for worth in (1e-4, 1e-2, 1.0, 100.0):
+        taps = Quadtree(SIZE, 17, worth).taps(x, y, share)
+        counts.append(len(taps.texels))
+        errors.append(float(np.sqrt(np.mean((summed(taps, image) - looked_up(image, x, y)) ** 2))))
+        told.append(float(np.sqrt(taps.error.mean())))
+    assert counts == sorted(counts, reverse=True)
+    assert errors == sorted(errors)
+    assert told == sorted(told)
+    assert counts[0] > 3 * counts[2]
+    assert errors[1] < 3.5
+
+
+def test_places_far_apart_are_not_averaged_over_what_lies_between():
+    """A pixel at the seam of two drops: half of its rays here, half there."""
+    image = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.float32)
+    image[:, 60:140] = 255
+    x, y = spread(np.array([[30.0, 70.0]]), np.array([[8.0, 0.0]]), np.array([[0.0, 8.0]]))
+    x[:, 0].reshape(SIDE, SIDE)[:, 4:] += 140
+    taps = Quadtree(SIZE, 17, 0.02).taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
+    assert summed(taps, image).max() < 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(0, 10**6), st.integers(1, 40), st.floats(0.1, 120), st.floats(0, 1.1), st.sampled_from([3, 5, 9, 17]),
+    st.sampled_from([0.0, 0.02, 4.0]),
+)  # fmt: skip
+def test_any_rays(seed, count, widest, gain, extent, worth):
+    """Sums of weights are those of the rays, to rounding; a pixel's taps do not depend on the others'."""
+    x, y = pixels(seed, count, widest)
+    rng = np.random.default_rng(seed)
+    weights = (rng.uniform(0, gain, x.shape) * (rng.random(x.shape) < 0.7) / SIDE**2).astype(np.float32)
+    tree = Quadtree(SIZE, extent, worth)
+    taps = tree.taps(x, y, weights)
+    assert taps.texels.min(initial=0) >= 0
+    assert taps.texels.max(initial=0) < starts(SIZE)[-1]
+    flat = np.ones((SIZE[1], SIZE[0], 3), dtype=np.float32)
+    np.testing.assert_allclose(summed(taps, flat)[:, 0], weights.sum(0), atol=1 / UNIT)
+    alone = tree.taps(x[:, :1], y[:, :1], weights[:, :1])
+    np.testing.assert_array_equal(taps.texels[: alone.counts[0]], alone.texels)
+    np.testing.assert_array_equal(taps.weights[: alone.counts[0]], alone.weights)
+
+
+def test_nothing_to_see():
+    empty = np.zeros((64, 0), dtype=np.float32)
+    taps = Quadtree(SIZE, 17, 0.02).taps(empty, empty, empty)
+    assert taps.texels.size == taps.counts.size == 0
+    dark = np.zeros((64, 3), dtype=np.float32)
+    assert Quadtree(SIZE, 17, 0.02).taps(dark, dark, dark).counts.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("size", [(4, 4), (7, 9), (1280, 960), (33, 8)])
+def test_levels_hold_every_texel(size):
+    levels = sizes(size)
+    assert starts(size)[-1] == sum(w * h for w, h in levels)
+    for (w, h), (a, b) in pairwise(levels):
+        assert (a, b) == ((w + 1) // 2, (h + 1) // 2)
