@@ -36,7 +36,7 @@ def page(findings: Findings, record: Record) -> Report:
         limiting(report, findings)
         slab_section(report, solution, findings)
         agreement(report, solution, findings)
-        corners: dict[str, Array] = {role: _corners(solution, role) for role in ROLES}
+        corners = {role: _corners(solution, role) for role in ROLES}
         capture_next(report, solution, findings.observations.board, corners)
         _fit(report, solution)
         _scene(report, solution)

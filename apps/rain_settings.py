@@ -104,13 +104,16 @@ class Rain:
     def standing(self, drops: Drops, name: str, size: Size) -> AnyDrops:
         """What there is to be seen of drops on a still: where the setup gives them time, some have run."""
         if not self.setup.age:
-            return self._shown(self.in_sight(drops, size))
+            return self._shown(self.in_sight(drops, size)) if self.merge else self.in_sight(drops, size)
         seed = int(self.seeds(f"{name}, motion").integers(2**62))
         state = Motion.physical(drops, self.pane(size), seed=seed).at(self.setup.age)
-        return [*(trail.streak(**drops.place) for trail in state.trails), self._shown(self.in_sight(state.drops, size))]
+        return [
+            *(trail.streak(**drops.place) for trail in state.trails),
+            *self._shown(self.in_sight(state.drops, size)),
+        ]
 
-    def _shown(self, drops: Drops) -> AnyDrops:
-        return joined_shapes(drops) if self.merge else drops
+    def _shown(self, drops: Drops) -> list[Drop | Drops]:
+        return list(joined_shapes(drops)) if self.merge else [drops]
 
     def drops(self, name: str, size: Size) -> Drops:
         """What falls on an image where no PSNR is asked for."""
