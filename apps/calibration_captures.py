@@ -153,7 +153,7 @@ def _require_both(options: Options) -> None:
     if not (options.dry and options.wet):
         raise ValueError(
             "give the board images of both cameras: --dry DIR --wet DIR, or folders that hold dry/ and wet/: "
-            "--chamber DIR, and for paired captures --bare DIR, too"
+            "--chamber DIR, and for paired captures --bare DIR, too; or --watch DIR while capturing"
         )
 
 

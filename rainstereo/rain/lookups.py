@@ -241,10 +241,11 @@ class Paste:
         edges = starts(self.size)
         level = np.repeat(np.arange(len(edges) - 1), np.diff(edges)).astype(np.uint8)
         found = []
-        for table in self.tables:
-            ends = np.cumsum(table.counts)
-            so_far = np.concatenate([[0], np.cumsum(table.weights * level[table.texels].astype(np.int64))])
-            found.append(so_far[ends] - so_far[ends - table.counts])
+        for piece in self.pieces:  # a whole table at once takes hundreds of MB
+            table, counts = piece.table, piece.table.counts[piece.rows]
+            of_taps = table.weights[piece.taps] * level[table.texels[piece.taps]].astype(np.int64)
+            so_far, ends = np.concatenate([[0], np.cumsum(of_taps)]), np.cumsum(counts)
+            found.append(so_far[ends] - so_far[ends - counts])
         shift = np.minimum(BIAS / UNIT * np.concatenate(found), DARKEST)
         return np.floor((0.5 - shift) * UNIT).astype(np.uint64) * np.uint64(EVERY)
 

@@ -173,7 +173,7 @@ def test_monte_carlo(tilt_deg: int) -> None:
     start = solve(synthetic.observe(synthetic.rig(known), rt, noise=0.1, seed=1), MODEL, known)
     grid = uncertainty.image_grid(np.array(synthetic.SIZE), (6, 4))
     errors: dict[str, list[Array]] = {}
-    for trial in range(60):
+    for trial in range(150):
         true = synthetic.rig(drawn(slab, rng))
         found = again(start, synthetic.observe(true, rt, noise=0.1, seed=trial), known)
         for d in distances:
