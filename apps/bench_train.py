@@ -29,8 +29,8 @@ PAPER = {"lambda_perceptual": 0.0}
 
 
 def build(seed: int, quick: bool) -> Stage:
-    """The stage at windows of 128 x 128, or 48 x 48 if `quick`."""
-    side, base = (48, 4) if quick else (128, 16)
+    """The stage at windows of 256 x 256, a recipe's default, or 48 x 48 if `quick`."""
+    side, base = (48, 4) if quick else (256, 16)
     return Stage(
         "train",
         "training",
