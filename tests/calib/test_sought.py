@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("mrcal", reason="mrcal is not installed")
 
 from rainstereo import Chamber, Panel, Rig
-from rainstereo.calib import hypotheses, panel_checks, uncertainty
+from rainstereo.calib import board_shape, hypotheses, panel_checks, uncertainty
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.prior import Prior
 from rainstereo.calib.slab import across
@@ -45,6 +45,13 @@ def found() -> tuple[Solution, Rig]:
     index = np.arange(2 * COUNT)
     sought = Sought(described(TRUE), ("tilt", "thickness"), None, index >= COUNT, index % COUNT, wedge=True)
     return solve(seen, "LENSMODEL_OPENCV5", sought), true
+
+
+def test_a_flat_board_is_not_called_twisted_where_panels_are_free(found: tuple[Solution, Rig]) -> None:
+    shape = board_shape.examine(found[0])
+    assert shape is not None
+    assert max(shape.twist_sigmas, shape.ripple_sigmas) < 4
+    assert shape.corner_sigma == pytest.approx(0.1, rel=0.05)
 
 
 def test_paired_captures_find_the_panels_and_the_board_that_moved(found: tuple[Solution, Rig]) -> None:
