@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import cv2
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rainstereo import Camera, Rig
 from rainstereo.apps.bench_harness import Stage, Target, Variant, Work
 from rainstereo.apps.board_poses import board_poses
-from rainstereo.apps.digital_rig import digital_rig, exact_observations
+from rainstereo.apps.digital_rig import digital_rig, exact_observations, noisy_observations
 from rainstereo.calib import mrcal_versions
 from rainstereo.calib.board import Board
 from rainstereo.calib.mrcal_versions import Free, Problem
@@ -159,7 +159,10 @@ def _work(name: str, pairs: int, through: bool, seed: int, draws: int, slow: int
     truth = digital_rig(seed=seed)
     poses = board_poses(truth, BOARD, pairs, seed)
     exact = exact_observations(truth, BOARD, poses, through)
-    noisy = [_observations(exact, truth, np.random.default_rng([seed, pairs, draw])) for draw in range(draws)]
+    noisy = [
+        noisy_observations(truth, BOARD, exact, NOISE_PX, np.random.default_rng([seed, pairs, draw]))
+        for draw in range(draws)
+    ]
 
     def variant(
         title: str, rig_of: Callable[[Observations], Rig], note: str, every: int = 1, ours: bool = False
@@ -196,13 +199,6 @@ def _work(name: str, pairs: int, through: bool, seed: int, draws: int, slow: int
         "match: error of wet pixels matched to dry ones at infinity, like the baseline's of the draw that was timed",
         targets=(Target(variants[0].name, None, 0.5),) if pairs == 13 and not through else (),
     )
-
-
-def _observations(exact: Sequence[Float], truth: Rig, rng: np.random.Generator) -> Observations:
-    dry, wet = (corners + rng.normal(0, NOISE_PX, corners.shape) for corners in exact)
-    names = tuple(f"{i:03d}" for i in range(len(dry)))
-    sizes: dict[str, tuple[int, int]] = {role: truth.camera(role).size for role in ROLES}
-    return Observations(board=BOARD, names=names, dry=dry, wet=wet, imagersize=sizes, rejected=())
 
 
 def _camera(K: Any, k: Any, size: tuple[int, int], pose: Float) -> Camera:

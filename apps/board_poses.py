@@ -9,6 +9,7 @@ import numpy as np
 from rainstereo import Rig
 from rainstereo.apps.digital_rig import seen_by
 from rainstereo.calib.board import Board
+from rainstereo.calib.board_candidates import outline, placed
 from rainstereo.pose import rotation_matrix, rotation_vector
 from rainstereo.rig import ROLES
 from rainstereo.types import Array, Indices, Mask
@@ -92,54 +93,37 @@ def _candidates(
     return np.concatenate([rotation_vector(R), centre - R @ middle], -1), depth, tilt
 
 
-def _outline(board: Board) -> Array:
-    """Border of the printed squares and half a square of white around them, (40, 3) metres."""
-    s = board.square
-    x0 = y0 = -board.margin - 0.5 * s
-    x1, y1 = (length - board.margin + 0.5 * s for length in board.size)
-    t = np.linspace(0, 1, 10, endpoint=False)
-    x = np.concatenate([x0 + (x1 - x0) * t, np.full(10, x1), x1 + (x0 - x1) * t, np.full(10, x0)])
-    y = np.concatenate([np.full(10, y0), y0 + (y1 - y0) * t, np.full(10, y1), y1 + (y0 - y1) * t])
-    return np.stack([x, y, np.zeros(40)], -1)
-
-
-def _placed(poses: Array, points: Array) -> Array:
-    """Points, (K, 3), of the board in the dry camera's frame, (M, K, 3)."""
-    placed: Array = np.einsum("mij,kj->mki", rotation_matrix(poses[:, :3]), points) + poses[:, None, 3:]
-    return placed
-
-
 def _clear(rig: Rig, board: Board, poses: Array) -> Mask:
     """Where the whole board, white border included, stands behind the chamber and faces both cameras, (M,)."""
-    outline = _placed(poses, _outline(board) * 1.05)
-    clear = outline[..., 2].min(-1) > LEAST
+    edge = placed(poses, outline(board, 0.5, 10) * 1.05)
+    clear = edge[..., 2].min(-1) > LEAST
     if rig.chamber is not None:
-        clear &= (outline @ np.array(rig.chamber.normal)).min(-1) > rig.chamber.depth + CLEARANCE
+        clear &= (edge @ np.array(rig.chamber.normal)).min(-1) > rig.chamber.depth + CLEARANCE
     facing = rotation_matrix(poses[:, :3])[:, :, 2]
-    sight = outline / np.linalg.norm(outline, axis=-1, keepdims=True)
+    sight = edge / np.linalg.norm(edge, axis=-1, keepdims=True)
     steep = np.einsum("mki,mi->mk", sight, facing).min(-1) < math.cos(STEEPEST)
     return np.asarray(clear & ~steep)
 
 
 def _visible(rig: Rig, board: Board, poses: Array, through: bool) -> Mask:
     whole = board.kind == "chessboard"
-    points = _outline(board) if whole else board.points.reshape(-1, 3)
+    points = outline(board, 0.5, 10) if whole else board.points.reshape(-1, 3)
     needed = 1.0 if whole else max(10, len(points) / 3) / len(points)
-    placed = _placed(poses, points)
+    there = placed(poses, points)
     visible = np.ones(len(poses), dtype=np.bool_)
     for role in ROLES:
-        seen = np.isfinite(seen_by(rig, role, placed, through)[..., 0])
+        seen = np.isfinite(seen_by(rig, role, there, through)[..., 0])
         visible &= seen.mean(-1) >= min(needed, 1.0)
     return visible
 
 
 def _cells(rig: Rig, board: Board, poses: Array, through: bool) -> Array:
     """Which cells of both frames hold corners of each board, (M, 2 * cells) 0 or 1."""
-    placed = _placed(poses, board.points.reshape(-1, 3))
+    there = placed(poses, board.points.reshape(-1, 3))
     count = CELLS[0] * CELLS[1]
     cells = np.zeros((len(poses), 2 * count))
     for i, role in enumerate(ROLES):
-        pixels = seen_by(rig, role, placed, through)
+        pixels = seen_by(rig, role, there, through)
         frame, corner = np.nonzero(np.isfinite(pixels[..., 0]))
         at = (pixels[frame, corner] + 0.5) / np.array(rig.camera(role).size) * np.array(CELLS)
         column, row = np.clip(at.astype(np.intp), 0, np.array(CELLS) - 1).T

@@ -14,6 +14,7 @@ import numpy as np
 
 from rainstereo import Camera, Chamber, Panel, Rig
 from rainstereo.calib.board import Board
+from rainstereo.calib.observations import Observations
 from rainstereo.pose import compose, rotation_matrix, transform
 from rainstereo.refraction import project
 from rainstereo.rig import ROLES, Role
@@ -173,6 +174,15 @@ def exact_observations(rig: Rig, board: Board, poses: Array, through: bool = Tru
         points[i] = transform(pose, board.points)
     dry, wet = (seen_by(rig, role, points, through) for role in ROLES)
     return dry, wet
+
+
+def noisy_observations(
+    rig: Rig, board: Board, exact: tuple[Array, Array], noise_px: float, rng: np.random.Generator
+) -> Observations:
+    """What `exact_observations` gave, with normal noise in each coordinate, pixels."""
+    dry, wet = (corners + rng.normal(0, noise_px, corners.shape) for corners in exact)
+    names = tuple(f"{i:03d}" for i in range(len(dry)))
+    return Observations(board, names, dry, wet, {role: rig.camera(role).size for role in ROLES})
 
 
 def rt_cam_board(rig: Rig, role: Role, rt_ref_board: Array) -> Array:

@@ -13,10 +13,9 @@ import numpy as np
 from rainstereo import Chamber, Panel, Rig
 from rainstereo.apps.bench_calibration import infinity_error
 from rainstereo.apps.board_poses import board_poses
-from rainstereo.apps.digital_rig import RigOptions, digital_rig, exact_observations, seen_by
+from rainstereo.apps.digital_rig import RigOptions, digital_rig, exact_observations, noisy_observations, seen_by
 from rainstereo.calib import contributions, point_uncertainty, uncertainty
 from rainstereo.calib.board import Board
-from rainstereo.calib.observations import Observations
 from rainstereo.calib.prior import Prior
 from rainstereo.calib.slab import across
 from rainstereo.calib.solve import Solution, solve
@@ -99,10 +98,8 @@ class Capture:
 
     def calibrated(self, rng: np.random.Generator) -> Solution:
         """One draw of the noise, calibrated."""
-        dry, wet = (corners + rng.normal(0, NOISE_PX, corners.shape) for corners in self.exact)
-        names = tuple(f"{i:03d}" for i in range(len(dry)))
-        sizes: dict[str, tuple[int, int]] = {role: self.truth.camera(role).size for role in ROLES}
-        return solve(Observations(BOARD, names, dry, wet, sizes), MODEL, self._sought(rng))
+        seen = noisy_observations(self.truth, BOARD, self.exact, NOISE_PX, rng)
+        return solve(seen, MODEL, self._sought(rng))
 
     def _sought(self, rng: np.random.Generator) -> Chamber | Sought | None:
         chamber, mode, count = self.truth.chamber, self.setting.mode, self.setting.frames

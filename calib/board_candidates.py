@@ -88,10 +88,15 @@ def mesh(board: Board, steps: int = 5) -> Array:
     return np.stack(lines)
 
 
+def placed(poses: Array, points: Array) -> Array:
+    """Points of boards, (N, 3), in the frame that the poses, (K, 6), are given in, (K, N, 3)."""
+    return np.asarray(np.einsum("kij,nj->kni", rotation_matrix(poses[:, :3]), points) + poses[:, None, 3:])
+
+
 def drawn(rig: Rig, poses: Array, points: Array) -> Array:
     """Pixels, (cameras, K, N, 2), of points of boards, (N, 3), through the rig's chamber; NaN where not seen."""
-    placed = np.einsum("kij,nj->kni", rotation_matrix(poses[:, :3]), points) + poses[:, None, 3:]
-    views = [project(transform(rig.camera(role).rt_cam_ref, placed), rig.camera(role), rig.chamber_in(role))[0]
+    there = placed(poses, points)
+    views = [project(transform(rig.camera(role).rt_cam_ref, there), rig.camera(role), rig.chamber_in(role))[0]
              for role in ROLES]  # fmt: skip
     return np.stack(views)
 
@@ -105,11 +110,11 @@ def views(rig: Rig, board: Board, poses: Array) -> tuple[Mask, Mask]:
 
 def clear(rig: Rig, board: Board, poses: Array) -> Mask:
     """Whether all of a board stands behind the chamber, (K,)."""
-    placed = np.einsum("kij,nj->kni", rotation_matrix(poses[:, :3]), outline(board, 0.5)) + poses[:, None, 3:]
-    far = placed[..., 2].min(-1) > NEAREST
+    edge = placed(poses, outline(board, 0.5))
+    far = edge[..., 2].min(-1) > NEAREST
     if rig.chamber is None:
         return np.asarray(far)
-    return np.asarray(far & ((placed @ np.array(rig.chamber.normal)).min(-1) > rig.chamber.depth + CLEARANCE))
+    return np.asarray(far & ((edge @ np.array(rig.chamber.normal)).min(-1) > rig.chamber.depth + CLEARANCE))
 
 
 def _inside(rig: Rig, pixels: Array) -> Mask:

@@ -16,8 +16,9 @@ from rainstereo.calib import sensitivity, uncertainty
 from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution
 from rainstereo.calib.uncertainty import Covariance
+from rainstereo.refraction import Status
 from rainstereo.rig import ROLES
-from rainstereo.triangulation import Status, triangulate
+from rainstereo.triangulation import triangulate
 from rainstereo.types import Array
 
 
@@ -26,7 +27,7 @@ class PointUncertainty:
     """Points, (N, 3) metres in the dry camera's frame, and their covariance; NaN where `status` is not 0.
 
     from_pixels, from_calibration: (N, 3, 3) square metres. by_calibration: (N, 3, S), how a point moves with the state.
-    status: (N,) `triangulation.Status`.
+    status: (N,) `refraction.Status`.
     """
 
     points: Array

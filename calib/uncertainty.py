@@ -139,18 +139,7 @@ def infinity_uncertainty(
     gauge: "boards" as mrcal has it, "image" for what is left after the best-fitting rotation.
     """
     cov = covariance(solution) if cov is None else cov
-    problem, index = problem_of(solution), ROLES.index(role)
-    pixels = image_grid(problem.sizes[index], grid)
-    lens = problem.lensmodel, problem.intrinsics[index]
-    rays, seen = _rays(pixels, *lens)
-    _, by_ray, by_lens = versions.project_gradients(rays, *lens)
-    F = np.zeros((len(rays), 2, cov.layout.size))
-    F[..., cov.layout.intrinsics[index]] = by_lens[..., cov.layout.intrinsics_columns]
-    if gauge == "boards":
-        _through_boards(F, rays, by_ray, problem, index, cov.layout)
-    else:
-        F += by_ray @ best_rotation(rays, by_ray, F)
-    return to_map(pixels, F, seen, cov)
+    return to_map(*far_pixels(problem_of(solution), cov.layout, role, grid, gauge), cov)
 
 
 def stereo_infinity_uncertainty(
@@ -161,7 +150,33 @@ def stereo_infinity_uncertainty(
     On a grid of (columns, rows) dry pixels. This is the error that stays in aligned pairs of far scenes.
     """
     cov = covariance(solution) if cov is None else cov
-    problem, layout = problem_of(solution), cov.layout
+    return to_map(*far_matches(problem_of(solution), cov.layout, grid), cov)
+
+
+def far_pixels(
+    problem: Problem, layout: Layout, role: Role, grid: tuple[int, int], gauge: Gauge
+) -> tuple[Array, Array, Mask]:
+    """How the pixels in which one camera sees directions at infinity depend on a calibration.
+
+    Returns the grid's pixels, (rows, columns, 2), the derivative by a state laid out as `layout`, (M, 2, S), of those
+    that the lens reaches, and which these are, (rows columns,).
+    """
+    index = ROLES.index(role)
+    pixels = image_grid(problem.sizes[index], grid)
+    lens = problem.lensmodel, problem.intrinsics[index]
+    rays, seen = _rays(pixels, *lens)
+    _, by_ray, by_lens = versions.project_gradients(rays, *lens)
+    F = np.zeros((len(rays), 2, layout.size))
+    F[..., layout.intrinsics[index]] = by_lens[..., layout.intrinsics_columns]
+    if gauge == "boards":
+        _through_boards(F, rays, by_ray, problem, index, layout)
+    else:
+        F += by_ray @ best_rotation(rays, by_ray, F)
+    return pixels, F, seen
+
+
+def far_matches(problem: Problem, layout: Layout, grid: tuple[int, int]) -> tuple[Array, Array, Mask]:
+    """The same of the wet pixels that see what dry pixels, (rows, columns, 2), see at infinity."""
     pixels = image_grid(problem.sizes[0], grid)
     rays, seen = _rays(pixels, problem.lensmodel, problem.intrinsics[0])
     _, by_ray, by_lens = versions.project_gradients(rays, problem.lensmodel, problem.intrinsics[0])
@@ -174,7 +189,7 @@ def stereo_infinity_uncertainty(
     ]
     F[..., layout.intrinsics[1]] = wet_by_lens[..., layout.intrinsics_columns]
     F[..., _rotation(layout.extrinsics, 0)] = wet_by_ray @ rotated_by(r, rays)
-    return to_map(pixels, F, seen, cov)
+    return pixels, F, seen
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,8 @@ class Status(IntEnum):
     """Behind the image plane, or beyond what the lens model describes."""
     NOT_CONVERGED = 4
     """Newton's method did not end; not known to happen."""
+    PARALLEL = 5
+    """Of two rays that are to meet (`triangulation`): they are parallel, the point at infinity, or too far to tell."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ angles and an inverse distance: in these the images of a far point are nearly li
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from . import refraction, types
 from .camera import Camera, floating
 from .chamber import Chamber
 from .pose import invert, rotation_matrix, transform
+from .refraction import Status
 from .rig import ROLES, Rig
 from .types import Array
 
@@ -29,25 +29,12 @@ PARALLEL = 1e-10
 """Rays at a smaller angle, radians, have no meeting point: with a baseline of 29 mm it would be 290,000 km away."""
 
 
-class Status(IntEnum):
-    """Why a pair of pixels has no point; 0 where it has one. Below 5 as in `refraction.Status`."""
-
-    SEEN = 0
-    NOT_FINITE = 1
-    BEHIND = 2
-    """The rays part: they meet behind the cameras, or within the chamber."""
-    NO_IMAGE = 3
-    """A pixel beyond what its lens model describes."""
-    NOT_CONVERGED = 4
-    PARALLEL = 5
-    """The rays are parallel: the point is at infinity, or too far to tell."""
-
-
 @dataclass(frozen=True, eq=False)
 class Triangulated:
     """Points and how well the two pixels agree on them; NaN where `status` is not 0.
 
-    points: (..., 3) metres in the dry camera's frame. status: (...,) `Status`.
+    points: (..., 3) metres in the dry camera's frame. status: (...,) `refraction.Status`; BEHIND: the rays
+    part, or meet behind the cameras or within the chamber.
     gap: (...,) metres, shortest distance between the two rays.
     residuals: (..., 4) pixels, projected minus given: dry x, y, wet x, y.
     by_pixels: (..., 3, 4) metres a pixel: how the point moves with the four coordinates, to first order.

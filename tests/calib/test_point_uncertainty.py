@@ -10,7 +10,7 @@ pytest.importorskip("mrcal", reason="mrcal is not installed")
 from rainstereo import pose, refraction
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib import point_uncertainty, uncertainty
-from rainstereo.calib.solve import Solution, solve
+from rainstereo.calib.solve import Solution
 from rainstereo.rig import Rig
 from rainstereo.triangulation import triangulate
 from rainstereo.types import Array
@@ -18,18 +18,8 @@ from rainstereo.types import Array
 from . import synthetic
 
 INSIDE = synthetic.chamber(15)
+"""What `through`, of conftest, looks through."""
 POINTS = np.array([[0.05, 0.02, 0.5], [-0.3, 0.2, 2.0], [1.0, -0.6, 6.0]])
-
-
-@pytest.fixture(scope="module")
-def bare() -> Solution:
-    return solve(synthetic.observe(synthetic.rig(), synthetic.poses(12, 1), noise=0.1, seed=0), "LENSMODEL_OPENCV5")
-
-
-@pytest.fixture(scope="module")
-def through() -> Solution:
-    seen = synthetic.observe(synthetic.rig(INSIDE), synthetic.poses(12, 1), noise=0.1, seed=0)
-    return solve(seen, "LENSMODEL_OPENCV5", INSIDE)
 
 
 def seen(rig: Rig, points: Array) -> tuple[Array, Array]:

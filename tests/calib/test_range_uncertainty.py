@@ -12,7 +12,7 @@ from rainstereo import Camera, Chamber, Panel, Rig, pose, refraction
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib import range_uncertainty, sensitivity, uncertainty
 from rainstereo.calib.slab import Slab
-from rainstereo.calib.solve import Solution, solve
+from rainstereo.calib.solve import Solution
 from rainstereo.calib.uncertainty import Covariance
 from rainstereo.rig import ROLES, Role
 from rainstereo.types import Array
@@ -20,17 +20,7 @@ from rainstereo.types import Array
 from . import synthetic
 
 INSIDE = synthetic.chamber(15)
-
-
-@pytest.fixture(scope="module")
-def bare() -> Solution:
-    return solve(synthetic.observe(synthetic.rig(), synthetic.poses(12, 1), noise=0.1, seed=0), "LENSMODEL_OPENCV5")
-
-
-@pytest.fixture(scope="module")
-def through() -> Solution:
-    seen = synthetic.observe(synthetic.rig(INSIDE), synthetic.poses(12, 1), noise=0.1, seed=0)
-    return solve(seen, "LENSMODEL_OPENCV5", INSIDE)
+"""What `through`, of conftest, looks through."""
 
 
 def stereo_pixels(rig: Rig, dry: Array, distance: float) -> Array:

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from rainstereo import Camera, Chamber, Panel, Rig, pose, refraction
-from rainstereo.triangulation import Status, triangulate
+from rainstereo.refraction import Status
+from rainstereo.triangulation import triangulate
 from rainstereo.types import Array
 
 PANELS = (Panel(0.004, 1.49), Panel(0.004, 1.49))
