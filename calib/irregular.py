@@ -3,8 +3,8 @@
 mrcal's boards are regular lattices. An AprilGrid could be given to it as the seen nodes of a finer lattice (tag / 10
 for gaps of 0.3), but that has 40 times as many nodes, all of which mrcal computes: 15 times as slow as what follows,
 and its regularization, which mrcal weighs by the number of nodes, is 40 times as strong. So the corners' rows of the
-least squares are computed here, by the chain rule through mrcal's own lens derivatives, in mrcal's own packed state,
-and solved by Levenberg and Marquardt's method. Regularization is taken over from mrcal as it is.
+least squares are those of `refracted`, without panels, in mrcal's own packed state, and solved by Levenberg and
+Marquardt's method. Regularization is taken over from mrcal as it is.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 
-from rainstereo import pose
 from rainstereo.calib import mrcal_versions as versions
+from rainstereo.calib import refracted
+from rainstereo.calib.damped_step import damped_step
 from rainstereo.calib.mrcal_versions import Layout, Linearization, Problem, SolveError
-from rainstereo.calib.rotation import rotated_by
 from rainstereo.types import Array
 
 MAX_STEPS = 300
@@ -33,63 +32,26 @@ FINEST = 240
 
 def off_by(problem: Problem) -> Array:
     """Projected minus observed corners, (M, rows, columns, 2) pixels."""
-    board = problem.board(problem.warp)
-    R, t = pose.rotation_matrix(problem.rt_ref_board[:, :3]), problem.rt_ref_board[:, 3:]
-    frames = problem.indices[:, 0]
-    placed = np.einsum("mij,rcj->mrci", R[frames], board) + t[frames, None, None]
-    off = np.empty((*problem.observations.shape[:3], 2))
-    for camera, rt in enumerate([np.zeros(6), *problem.rt_cam_ref]):
-        mine = problem.indices[:, 1] == camera
-        points = pose.transform(rt, placed[mine])
-        off[mine] = versions.project(points, problem.lensmodel, problem.intrinsics[camera])
-    return np.asarray(off - problem.observations[..., :2])
+    return np.asarray(refracted.bare_pixels(problem) - problem.observations[..., :2])
 
 
 def rows(problem: Problem, layout: Layout, scale: Array) -> tuple[Array, scipy.sparse.csr_matrix]:
     """Weighted residuals of all corners, (n,), and their derivatives by the packed state, (n, S)."""
     weight = np.maximum(problem.observations[..., 2], 0)
-    off = np.where(weight[..., None] > 0, off_by(problem) * weight[..., None], 0)
+    residuals = np.zeros((*weight.shape, 2))
     values, where, numbers = [], [], []
     count = weight[0].size
-    for camera in range(len(problem.intrinsics)):
-        mine = np.flatnonzero(problem.indices[:, 1] == camera)
-        J, columns = _derivatives(problem, layout, camera, problem.indices[mine, 0])
-        J = np.where(weight[mine].reshape(-1, count, 1, 1) > 0, J * weight[mine].reshape(-1, count, 1, 1), 0)
-        J = J * scale[columns][:, None, None]
-        row = (mine[:, None] * count + np.arange(count))[..., None] * 2 + np.arange(2)
+    for camera in np.unique(problem.indices[:, 1]).tolist():
+        mine, J, off, columns = refracted.bare_rows(problem, layout, camera)
+        own = weight[mine].reshape(-1, count, 1)
+        residuals[mine] = np.where(own > 0, off * own, 0).reshape(-1, *weight.shape[1:], 2)
+        J = np.where(own[..., None] > 0, J * own[..., None], 0) * scale[columns][:, None, None]
+        row = (np.flatnonzero(mine)[:, None] * count + np.arange(count))[..., None] * 2 + np.arange(2)
         values.append(J.ravel())
         where.append(np.broadcast_to(columns[:, None, None], J.shape).ravel())
         numbers.append(np.broadcast_to(row[..., None], J.shape).ravel())
     entries = np.concatenate(values), (np.concatenate(numbers), np.concatenate(where))
-    return off.ravel(), scipy.sparse.csr_matrix(entries, shape=(off.size, layout.size))
-
-
-def _derivatives(problem: Problem, layout: Layout, camera: int, frames: Array) -> tuple[Array, Array]:
-    """Of one camera's views: derivatives by the state, (V, N, 2, s), and the columns that they belong to, (V, s)."""
-    rt = np.zeros(6) if camera == 0 else problem.rt_cam_ref[camera - 1]
-    board, views = problem.board(problem.warp).reshape(-1, 3), len(frames)
-    R = pose.rotation_matrix(problem.rt_ref_board[frames, :3])
-    placed = np.einsum("vij,nj->vni", R, board) + problem.rt_ref_board[frames, None, 3:]
-    _, by_point, by_lens = versions.project_gradients(
-        pose.transform(rt, placed), problem.lensmodel, problem.intrinsics[camera]
-    )
-    parts: list[Array] = [by_lens[..., layout.intrinsics_columns]]
-    columns: list[Array] = [np.tile(_range(layout.intrinsics[camera]), (views, 1))]
-    if camera and layout.extrinsics.stop:
-        parts += [by_point @ rotated_by(rt[:3], placed), by_point]
-        start = layout.extrinsics.start + 6 * (camera - 1)
-        columns.append(np.tile(np.arange(start, start + 6), (views, 1)))
-    by_reference = by_point @ pose.rotation_matrix(rt[:3])
-    if layout.frames.stop:
-        turned = np.stack([rotated_by(r, board) for r in problem.rt_ref_board[frames, :3]])
-        parts += [by_reference @ turned, by_reference]
-        columns.append(layout.frames.start + 6 * frames[:, None] + np.arange(6))
-    if layout.warp.stop:
-        heights = np.stack([problem.board(unit)[..., 2].ravel() for unit in np.eye(2)], -1)
-        lifted = np.einsum("vnij,vj->vni", by_reference, R[..., 2])
-        parts.append(lifted[..., None] * heights[None, :, None])
-        columns.append(np.tile(_range(layout.warp), (views, 1)))
-    return np.concatenate(parts, -1), np.concatenate(columns, -1)
+    return residuals.ravel(), scipy.sparse.csr_matrix(entries, shape=(residuals.size, layout.size))
 
 
 def optimize(problem: Problem) -> None:
@@ -98,7 +60,7 @@ def optimize(problem: Problem) -> None:
     cost = _cost(at)
     for _ in range(MAX_STEPS):
         J = at.jacobian
-        step = _step((J.T @ J).toarray(), J.T @ at.residuals, damping)
+        step = damped_step((J.T @ J).toarray(), J.T @ at.residuals, damping)
         trial = problem.copy()
         versions.ingest(trial, at.packed + step)
         ahead = versions.linearize(trial)
@@ -121,16 +83,6 @@ def _cost(at: Linearization) -> float:
     return total if np.isfinite(total) else np.inf
 
 
-def _step(normal: Array, gradient: Array, damping: float) -> Array:
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal * np.outer(scale, scale) + damping * np.eye(len(scale))
-    try:
-        solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(scaled), scale * gradient)
-    except scipy.linalg.LinAlgError:  # not determined by the corners: the smallest step that helps
-        solved = np.linalg.lstsq(scaled, scale * gradient, rcond=1e-12)[0]
-    return np.asarray(-scale * solved)
-
-
 def as_regular(problem: Problem) -> Problem | None:
     """The same problem on a regular lattice fine enough to hold all corners, its other nodes unseen.
 
@@ -149,7 +101,3 @@ def as_regular(problem: Problem) -> Problem | None:
     observations = np.zeros((len(problem.observations), int(at[1][-1]) + 1, int(at[0][-1]) + 1, 3))
     observations[:, at[1][:, None], at[0]] = problem.observations
     return replace(problem.copy(observations=observations, spacing=unit), lattice=None)
-
-
-def _range(span: slice) -> Array:
-    return np.arange(span.start, span.stop)

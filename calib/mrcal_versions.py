@@ -278,6 +278,15 @@ def residuals(problem: Problem) -> Array:
     return np.divide(board, weight, out=np.full_like(board, np.nan), where=weight > 0)
 
 
+def regularization(problem: Problem) -> Array:
+    """Residuals of mrcal's regularization at the problem's state, (n,); empty without it."""
+    mrcal, arguments = load(), problem.arguments()
+    with quiet():
+        x = mrcal.optimizer_callback(**arguments, no_jacobian=True, no_factorization=True)[1]
+        boards = mrcal.num_measurements_boards(**arguments)
+    return np.array(x[int(boards) :], dtype=np.float64)
+
+
 def linearize(problem: Problem) -> Linearization:
     """Residuals and Jacobian at the problem's state."""
     mrcal, arguments = load(), problem.arguments()

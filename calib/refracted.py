@@ -123,7 +123,14 @@ def pixels(problem: Problem, panels: Chamber | Panels) -> Array:
 
 def bare_pixels(problem: Problem) -> Array:
     """Where the cameras would see each corner without a chamber, (M, rows, columns, 2)."""
-    return pixels(problem, Panels(Slab(_NOTHING), np.zeros(len(problem.rt_ref_board), dtype=np.bool_)))
+    return pixels(problem, _nothing(problem))
+
+
+def bare_rows(problem: Problem, layout: Layout, camera: int) -> tuple[Mask, Array, Array, Array]:
+    """Of one camera's views without a chamber: which observations they are, (M,), Jacobian by the state, (V, N, 2, s),
+    residuals, (V, N, 2) pixels, and the columns of the state, (V, s); neither weighed nor scaled."""
+    place, J, off, columns = _rows(problem, problem.observations[..., :2], _nothing(problem), camera, layout)
+    return place.rows, J, off, columns
 
 
 def cost(problem: Problem, observed: Array, panels: Chamber | Panels) -> float:
@@ -131,8 +138,7 @@ def cost(problem: Problem, observed: Array, panels: Chamber | Panels) -> float:
     panels = Panels.of(panels)
     weight = np.maximum(problem.observations[..., 2:], 0)
     off = np.where(weight > 0, (pixels(problem, panels) - observed) * weight, 0)
-    at = versions.linearize(problem)
-    total = float(np.sum(off**2) + np.sum(at.residuals[at.boards :] ** 2))
+    total = float(np.sum(off**2) + np.sum(versions.regularization(problem) ** 2))
     if panels.prior is not None:
         total += panels.noise_px**2 * panels.prior.chi2(panels.slab)
     return total
@@ -216,7 +222,7 @@ def _moved(panels: Panels, place: _Place) -> tuple[Array, Array, Array, Array | 
     behind = panels.behind(place.frames)
     count = int(behind.sum())
     view = slabs.view(panels.slab, u[behind].reshape(-1, 3), place.centre)
-    _require_seen(place, panels, behind, u[behind], view.status.reshape(count, -1))
+    _require_seen(place, panels, behind, u[behind], view.status.reshape(count, u.shape[1]))
 
     def spread(of_behind: Array, otherwise: float | Array) -> Array:
         if behind.all():
@@ -273,3 +279,8 @@ def _range(span: slice) -> Array:
 
 
 _NOTHING = Chamber((0, 0, 1), 1.0, ())
+
+
+def _nothing(problem: Problem) -> Panels:
+    """Panels that no frame was taken through."""
+    return Panels(Slab(_NOTHING), np.zeros(len(problem.rt_ref_board), dtype=np.bool_))

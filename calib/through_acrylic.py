@@ -15,10 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib import refracted
+from rainstereo.calib.damped_step import damped_step
 from rainstereo.calib.mrcal_versions import Problem
 from rainstereo.calib.refracted import ChamberError, Panels
 from rainstereo.chamber import Chamber
@@ -70,7 +70,7 @@ def refine(problem: Problem, seen: Array, panels: Chamber | Panels, *, tolerance
     damping, change, best = DAMPING, np.inf, refracted.normal_equations(problem, seen, panels)
     taking_part = problem.observations[..., 2] > 0
     for count in range(1, MAX_PASSES + 1):
-        step = panels.spread(best.layout, _step(best, damping, _stuck(panels, best)))
+        step = panels.spread(best.layout, damped_step(best.matrix, best.gradient, damping, _stuck(panels, best)))
         trial, moved = problem.copy(), _ahead(panels, best, step)
         versions.ingest(trial, best.packed + step[: len(best.packed)])
         cost = _cost(trial, seen, moved)
@@ -117,15 +117,3 @@ def _cost(problem: Problem, seen: Array, panels: Panels) -> float:
     except ChamberError:  # a step too far put a board where it cannot be
         return np.inf
     return cost if np.isfinite(cost) else np.inf
-
-
-def _step(normal: refracted.Normal, damping: float, stuck: Mask) -> Array:
-    """The damped Gauss-Newton step of the state; none where it is stuck."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal.matrix), 1e-300))
-    scale[stuck] = 0
-    scaled = normal.matrix * np.outer(scale, scale) + np.diag(damping + stuck)
-    try:
-        solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(scaled), scale * normal.gradient)
-    except scipy.linalg.LinAlgError:  # not determined by the corners: the smallest step that helps
-        solved = np.linalg.lstsq(scaled, scale * normal.gradient, rcond=1e-12)[0]
-    return np.asarray(-scale * solved)

@@ -8,6 +8,8 @@ pytest.importorskip("mrcal", reason="mrcal is not installed")
 from rainstereo import Chamber, Panel
 from rainstereo.calib import adjust, mrcal_versions, refracted
 from rainstereo.calib.mrcal_versions import Free, Problem
+from rainstereo.calib.refracted import Panels
+from rainstereo.calib.slab import Slab
 from rainstereo.rig import ROLES
 
 from . import synthetic
@@ -39,6 +41,27 @@ def test_pixels_are_those_of_the_core(tilt_deg: float) -> None:
     off = refracted.pixels(problem, chamber) - observed
     assert np.abs(off[taking_part]).max() < 1e-9
     assert refracted.cost(problem, observed, chamber) < 1e-15
+
+
+def test_frames_before_no_panels_are_those_of_mrcal() -> None:
+    """A camera may have seen no frame through the panels; the equations then are the bare ones, which mrcal knows."""
+    chamber = synthetic.chamber(20)
+    problem, observed = problem_at_truth(chamber, regularization=True)
+    problem.observations[..., :2] += np.random.default_rng(2).normal(size=observed.shape)
+    nowhere = np.zeros(len(problem.rt_ref_board), dtype=np.bool_)
+    normal = refracted.normal_equations(
+        problem, problem.observations[..., :2], Panels(Slab(chamber, ("tilt",)), nowhere)
+    )
+    at = mrcal_versions.linearize(problem)
+    own = slice(0, len(at.packed))
+    expected = (at.jacobian.T @ at.jacobian).toarray()
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        normal.matrix[own, own] / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-9
+    )
+    np.testing.assert_allclose(normal.gradient[own] / scale, at.jacobian.T @ at.residuals / scale, atol=1e-7)
+    assert normal.cost == pytest.approx(float(at.residuals @ at.residuals), rel=1e-9)
+    np.testing.assert_array_equal(normal.matrix[normal.layout.slab], 0)
 
 
 FREEDOMS = (
