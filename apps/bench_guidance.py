@@ -16,8 +16,8 @@ from rainstereo.apps.digital_rig import digital_rig, exact_observations
 from rainstereo.apps.guided_capture import Captured, anywhere, capture, unsteady
 from rainstereo.calib import guidance
 from rainstereo.calib.guidance import Proposal
+from rainstereo.calib.incremental import Incremental, View
 from rainstereo.calib.observations import Observations
-from rainstereo.calib.running import Running, View
 from rainstereo.calib.solve import Solution, solve
 
 TARGET_PX, SEEDS, LIMIT = 0.4, 3, 60
@@ -53,14 +53,14 @@ def build(seed: int, quick: bool) -> Stage:
     )
 
 
-def _running(pairs: int, seed: int) -> tuple[Rig, Running, View]:
+def _running(pairs: int, seed: int) -> tuple[Rig, Incremental, View]:
     """A rig, a calibration of all pairs but one, and that one."""
     truth = digital_rig(seed=seed)
     poses = board_poses(truth, BOARD, pairs, seed)
     rng = np.random.default_rng([seed, pairs])
     dry, wet = (corners + rng.normal(0, NOISE_PX, corners.shape) for corners in exact_observations(truth, BOARD, poses))
     views = [View(f"{i:03d}", np.stack([dry[i], wet[i]])) for i in range(pairs)]
-    running = Running(BOARD, (truth.dry.size, truth.wet.size), MODEL, truth.chamber, redundant=0.0)
+    running = Incremental(BOARD, (truth.dry.size, truth.wet.size), MODEL, truth.chamber, redundant=0.0)
     for view in views[:-1]:
         running.add(view, solve_now=False)
     running.solve_afresh()
@@ -150,7 +150,7 @@ def _redundant(pairs: int, seed: int) -> Work:
     still = poses[:: max(pairs // 12, 1)]
     held = np.concatenate([poses, again, still])
     dry, wet = (corners + rng.normal(0, NOISE_PX, corners.shape) for corners in exact_observations(truth, BOARD, held))
-    running = Running(BOARD, (truth.dry.size, truth.wet.size), MODEL, truth.chamber)
+    running = Incremental(BOARD, (truth.dry.size, truth.wet.size), MODEL, truth.chamber)
     for i in rng.permutation(len(held)):
         running.add(View(f"{i:03d}", np.stack([dry[i], wet[i]])), solve_now=False)
     running.catch_up()

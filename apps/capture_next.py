@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rainstereo.apps import figures, trust_figures
 from rainstereo.apps.report import Report, quantity
-from rainstereo.calib import gaps, guidance
+from rainstereo.calib import guidance, missing_views
 from rainstereo.calib.board import Board
 from rainstereo.calib.mrcal_versions import SolveError
 from rainstereo.calib.solve import Solution
@@ -17,7 +17,7 @@ WORTH = 0.05
 
 def capture_next(report: Report, solution: Solution, board: Board, corners: dict[Role, Array]) -> None:
     """Which pose would help most, what the capture lacks, and maps of its corners (per role (F, rows, columns, 2))."""
-    wanted = gaps.missing(solution)
+    wanted = missing_views.missing(solution)
     report.section(
         "What to capture next",
         "These frames lack:"

@@ -14,7 +14,7 @@ from rainstereo import Rig
 from rainstereo.apps.digital_rig import exact_observations
 from rainstereo.calib import board_candidates, guidance
 from rainstereo.calib.board import Board
-from rainstereo.calib.running import Running, View
+from rainstereo.calib.incremental import Incremental, View
 from rainstereo.pose import compose, rotation_matrix, rotation_vector
 from rainstereo.types import Array
 
@@ -29,7 +29,7 @@ TRIES = 2000
 class Captured:
     """How many pairs were taken, and the worst sigma at infinity after each, pixels (inf before the first solution)."""
 
-    running: Running
+    running: Incremental
     worst: tuple[float, ...]
 
     @property
@@ -45,7 +45,7 @@ def capture(truth: Rig, board: Board, lensmodel: str, *, target: float, guided: 
     The first few are anywhere; after that guided ones follow each proposal as a person would, the others are anywhere.
     """
     rng = np.random.default_rng([seed, 0x6D])
-    running = Running(board, (truth.dry.size, truth.wet.size), lensmodel, truth.chamber)
+    running = Incremental(board, (truth.dry.size, truth.wet.size), lensmodel, truth.chamber)
     worst: list[float] = []
     while len(worst) < limit:
         pose = anywhere(truth, board, rng)

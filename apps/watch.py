@@ -28,9 +28,9 @@ from rainstereo.apps.watch_state import State
 from rainstereo.calib import mrcal_versions
 from rainstereo.calib.board import Board
 from rainstereo.calib.checks import MORE_VIEWS, Finding, Verdict
+from rainstereo.calib.incremental import AUTOMATIC, FEWEST, SPLINED
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.rejection import NotEnoughData, Rejection
-from rainstereo.calib.running import AUTOMATIC, FEWEST, SPLINED
 from rainstereo.rig import ROLES
 
 BETWEEN_LOOKS_S = 0.15

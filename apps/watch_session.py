@@ -22,7 +22,7 @@ from rainstereo.calib.board import Board
 from rainstereo.calib.board_search import Agreed, agree, find
 from rainstereo.calib.corner_cache import Found
 from rainstereo.calib.guidance import Proposal
-from rainstereo.calib.running import Running, View
+from rainstereo.calib.incremental import Incremental, View
 from rainstereo.imagefile import UnreadableImageError
 from rainstereo.pairs import Pair
 from rainstereo.rig import ROLES
@@ -41,7 +41,7 @@ class Session:
     def __init__(self, folder: Path, board: Board, lensmodel: str, chamber: Chamber | None, target: float,
                  cache: Path | None, publish: Publish, event: Callable[[State], None]) -> None:  # fmt: skip
         self.board, self.lensmodel, self.chamber, self.target, self.cache = board, lensmodel, chamber, target, cache
-        self.running: Running | None = None
+        self.running: Incremental | None = None
         self.proposal: Proposal | None = None
         self.phase: Phase = "waiting"
         self.files: dict[str, Pair] = {}
@@ -158,7 +158,7 @@ class Session:
         return self._note(searched, before) if gone or new or solved else False
 
     def _restart(self, sizes: tuple[tuple[int, int], ...], frames: list[tuple[str, View | None, str]]) -> None:
-        running = Running(self.board, (sizes[0], sizes[1]), self.lensmodel, self.chamber)
+        running = Incremental(self.board, (sizes[0], sizes[1]), self.lensmodel, self.chamber)
         for name, view, reason in frames:
             if view is None or (reason and not np.isfinite(view.corners).any((1, 2, 3)).all()):
                 running.refuse(name, reason)
@@ -242,7 +242,7 @@ def _view(agreed: Agreed) -> View:
     return View(agreed.pair.name, agreed.corners)
 
 
-def _same(running: Running, agreed: Agreed) -> bool:
+def _same(running: Incremental, agreed: Agreed) -> bool:
     view = running.views.get(agreed.pair.name)
     if view is None:
         return running.judged[agreed.pair.name].reason == agreed.reason

@@ -12,7 +12,7 @@ import numpy as np
 from rainstereo.apps.arrivals import Trouble
 from rainstereo.calib.far_directions import MAPS
 from rainstereo.calib.guidance import Proposal
-from rainstereo.calib.running import Running
+from rainstereo.calib.incremental import Incremental
 from rainstereo.rig import ROLES
 from rainstereo.types import Array
 
@@ -64,7 +64,7 @@ class State:
 
 
 def state_of(
-    running: Running | None,
+    running: Incremental | None,
     proposal: Proposal | None,
     *,
     phase: Phase,
@@ -111,7 +111,7 @@ def state_of(
     )
 
 
-def _coverage(running: Running, camera: int) -> list[list[int]]:
+def _coverage(running: Incremental, camera: int) -> list[list[int]]:
     """Corners of the frames used, counted in each cell of a camera's image."""
     counts = np.zeros(CELLS[::-1], dtype=int)
     names = running.names("used") + running.names("waiting")

@@ -125,7 +125,7 @@ class Problem:
     `calobject_warp`, metres. observations: (M, rows, columns, 3): x, y in pixels and weight, 0 or less = ignored.
     indices: (M, 3): frame, camera, camera - 1; sorted. sizes: (cameras, 2) width, height. spacing: metres.
     lattice: where columns and rows stand, (columns,) and (rows,) metres, if not at steps of `spacing`; mrcal knows only
-    such steps, `irregular` does the rest.
+    such steps, `unequal_steps` does the rest.
     `optimize` changes all state in place and marks outliers by a negative weight.
     """
 
@@ -242,9 +242,9 @@ def optimize(problem: Problem, *, outliers: bool = False) -> None:
     if problem.lattice is not None:
         if outliers:
             raise ValueError("mrcal's own rejection of outliers is for boards with equal steps only")
-        from rainstereo.calib import irregular
+        from rainstereo.calib import unequal_steps
 
-        irregular.optimize(problem)
+        unequal_steps.optimize(problem)
         _require_sane(problem)
         return
     mrcal = load()
@@ -267,9 +267,9 @@ def _require_sane(problem: Problem, printed: str = "") -> None:
 def residuals(problem: Problem) -> Array:
     """Projected minus observed corners, (M, rows, columns, 2) unweighted pixels; NaN where weight <= 0."""
     if problem.lattice is not None:
-        from rainstereo.calib import irregular
+        from rainstereo.calib import unequal_steps
 
-        return np.where(problem.observations[..., 2:] > 0, irregular.off_by(problem), np.nan)
+        return np.where(problem.observations[..., 2:] > 0, unequal_steps.off_by(problem), np.nan)
     with quiet():
         x = load().optimizer_callback(**problem.arguments(), no_jacobian=True, no_factorization=True)[1]
     shape = problem.observations.shape[:-1]
@@ -298,9 +298,9 @@ def linearize(problem: Problem) -> Linearization:
     at = Linearization(np.array(packed), np.array(x), jacobian, scale, int(boards))
     if problem.lattice is None:
         return at
-    from rainstereo.calib import irregular
+    from rainstereo.calib import unequal_steps
 
-    off, by_state = irregular.rows(problem, layout(problem), scale)
+    off, by_state = unequal_steps.rows(problem, layout(problem), scale)
     rest = at.boards
     return replace(
         at,
@@ -403,9 +403,9 @@ def carried(problem: Problem, camera: int) -> dict[str, Any]:
     Written in the names from before 2.5, which every release reads. Plain arrays only, no pickle.
     """
     if problem.lattice is not None:
-        from rainstereo.calib import irregular
+        from rainstereo.calib import unequal_steps
 
-        regular = irregular.as_regular(problem)
+        regular = unequal_steps.as_regular(problem)
         if regular is None:
             return {}
         problem = regular

@@ -26,12 +26,12 @@ from rainstereo.types import Array, Image, Indices, Mask
 from . import drop_list, linear_light
 from .blurred import BlurredLayer, by_disc
 from .drops import Drops
-from .glance import Glance
 from .looks import Looks, PasteLooks
 from .lookups import Lookups, Paste
 from .minified import Batch, Minifier
 from .outlines import Outlines
 from .rendered import Rendered
+from .single_ray import SingleRay
 from .streaks import Streak
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class Renderer:
     border: what lies beyond the image: "mirror", "edge", or a `Surround` of it, beyond which it is mirrored.
     linear_light: whether values are sRGB and light is to be averaged, not values.
     moving: whether most drops move from frame to frame: plans of caps on one far face are made some fifty times as
-    fast, frames drawn in about twice the time, and pixels in drops off by 4 gray levels or so (`glance`).
+    fast, frames drawn in about twice the time, and pixels in drops off by 4 gray levels or so (`single_ray`).
     """
 
     camera: Camera
@@ -147,10 +147,10 @@ class Renderer:
         caps = [drop for group in groups for drop in group.drops if isinstance(drop, SphericalCap)]
         places = {(cap.panel, cap.face) for cap in caps}
         if len(caps) < sum(len(group.drops) for group in groups) or len(places) > 1 or caps[0].face != "far":
-            return self._glance.tables(self._batches(groups, given))
+            return self._single_ray.tables(self._batches(groups, given))
         pixels, which = Outlines.joined([group.outlines for group in groups]).pixels()
         of_drop = np.repeat(given, [len(group.drops) for group in groups])
-        return self._glance.tables_of_caps(caps, pixels, which, of_drop[which])
+        return self._single_ray.tables_of_caps(caps, pixels, which, of_drop[which])
 
     def _batches(self, groups: Sequence[Group], numbers: Indices) -> list[Batch]:
         """Caps of a face in one batch if each is alone, in another if not; groups with other drops on their own."""
@@ -168,8 +168,8 @@ class Renderer:
         )  # fmt: skip
 
     @cached_property
-    def _glance(self) -> Glance:
-        return Glance(self._minifier)
+    def _single_ray(self) -> SingleRay:
+        return SingleRay(self._minifier)
 
     # -- the image that holds the scene --------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("mrcal", reason="mrcal is not installed")
 
-from rainstereo.calib import adjust, board_shape, information, irregular, uncertainty
+from rainstereo.calib import adjust, board_shape, information, uncertainty, unequal_steps
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.board import Board
 from rainstereo.calib.mrcal_versions import Free, Problem
@@ -42,7 +42,7 @@ def test_rows_are_those_of_mrcal_on_a_finer_lattice() -> None:
     problem = problem_of(GRID, 3)
     problem.observations[1, 2, 3, 2] = -1  # an outlier
     assert problem.lattice is not None
-    fine = irregular.as_regular(problem)
+    fine = unequal_steps.as_regular(problem)
     assert fine is not None
     assert fine.observations.shape[1:3] == (3 * 3, 4 * 3)  # a gap is a step, a tag two
     assert fine.spacing == pytest.approx(0.012)
@@ -60,7 +60,7 @@ def test_rows_are_those_of_mrcal_on_a_finer_lattice() -> None:
 def test_the_minimum_is_that_of_mrcal() -> None:
     problem = problem_of(GRID, 8)
     problem.regularization = False  # mrcal weighs it by the number of nodes, seen or not
-    fine = irregular.as_regular(problem)
+    fine = unequal_steps.as_regular(problem)
     assert fine is not None
     versions.optimize(problem)
     versions.optimize(fine)
@@ -110,7 +110,7 @@ def test_thinned_boards_tell_as_much_as_the_regular_boards_that_they_are() -> No
 
 def test_a_lattice_too_fine_for_mrcal_is_left_out_of_the_file() -> None:
     problem = problem_of(Board.parse("aprilgrid:4x3:24mm:0.3137"), 3)
-    assert irregular.as_regular(problem) is None
+    assert unequal_steps.as_regular(problem) is None
     assert versions.carried(problem, 0) == {}
     with pytest.raises(ValueError, match="equal steps only"):
         versions.optimize(problem, outliers=True)

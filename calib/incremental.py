@@ -93,7 +93,7 @@ class _Placed:
     like: str = ""
 
 
-class Running:
+class Incremental:
     """A calibration in progress. Not for several threads at once.
 
     judged: what became of each frame, by name, in the order in which they came. solution, known: the present solution

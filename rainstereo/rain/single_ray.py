@@ -40,7 +40,7 @@ FOUR = (np.arange(4, dtype=np.float32) - np.float32(1.5)) / 4
 TWO = np.array([-0.25, 0.25], dtype=np.float32)
 
 
-class Glance:
+class SingleRay:
     """Makes tables of looks. minifier: traces, and knows the image that holds the scene."""
 
     def __init__(self, minifier: Minifier) -> None:

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("mrcal", reason="mrcal is not installed")
 
 from rainstereo import pose
-from rainstereo.calib import gaps
+from rainstereo.calib import missing_views
 from rainstereo.calib.solve import Solution, solve
 from rainstereo.types import Array
 
@@ -33,9 +33,9 @@ ALL = [(30.0, 0.0), (-30.0, 0.0), (0.0, 30.0), (0.0, -30.0)]
 
 def test_a_good_capture_lacks_nothing() -> None:
     found = solve(synthetic.observe(synthetic.rig(), synthetic.poses(16, 1), noise=0.05), "LENSMODEL_OPENCV4")
-    assert gaps.leans(found) == []
-    assert gaps.distances(found) == []
-    assert not any("middle" in words for words in gaps.places(found))
+    assert missing_views.leans(found) == []
+    assert missing_views.distances(found) == []
+    assert not any("middle" in words for words in missing_views.places(found))
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_a_good_capture_lacks_nothing() -> None:
 def test_the_lean_that_is_missing_is_named(missing: tuple[float, float], side: str) -> None:
     others = [lean for lean in ALL if lean != missing]
     found = solved(placed(others, [0.3, 0.6]))
-    (words,) = gaps.leans(found)
+    (words,) = missing_views.leans(found)
     assert f"its {side} side nearer" in words
     # second formulation: that side is nearer to the camera in a board that leans so
     board = synthetic.BOARD.points
@@ -56,11 +56,11 @@ def test_the_lean_that_is_missing_is_named(missing: tuple[float, float], side: s
 
 def test_distances_and_places() -> None:
     far = solved(placed(ALL, [0.6, 0.7]))
-    words = " ".join(gaps.distances(far))
+    words = " ".join(missing_views.distances(far))
     assert "nearest board was 0.6" in words
     assert "all boards were" in words
     one_side = solved(placed(ALL, [0.3, 0.5], at=(-0.25, -0.1)))
-    (dry, wet) = gaps.places(one_side)
+    (dry, wet) = missing_views.places(one_side)
     assert "right edge" in dry
     assert "bottom right corner" in dry
     assert "wet camera" in wet

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rainstereo.calib import guidance
+from rainstereo.calib.incremental import REDUNDANT, Incremental, View
 from rainstereo.calib.observations import Observations
-from rainstereo.calib.running import REDUNDANT, Running, View
 from rainstereo.calib.solve import Solution, solve
 
 from . import synthetic
@@ -26,8 +26,8 @@ def seen(count: int = 12, *, noise: float = 0.1, seed: int = 3, poses: np.ndarra
     return synthetic.observe(TRUE, held, noise=noise, seed=seed)
 
 
-def running(redundant: float = 0.0, lensmodel: str = MODEL) -> Running:
-    return Running(synthetic.BOARD, (synthetic.SIZE, synthetic.SIZE), lensmodel, TRUE.chamber, redundant=redundant)
+def running(redundant: float = 0.0, lensmodel: str = MODEL) -> Incremental:
+    return Incremental(synthetic.BOARD, (synthetic.SIZE, synthetic.SIZE), lensmodel, TRUE.chamber, redundant=redundant)
 
 
 def views(observations: Observations) -> list[View]:
@@ -35,7 +35,7 @@ def views(observations: Observations) -> list[View]:
             for i, name in enumerate(observations.names)]  # fmt: skip
 
 
-def fed(now: Running, frames: Iterable[View], *, at_once: bool = False) -> Running:
+def fed(now: Incremental, frames: Iterable[View], *, at_once: bool = False) -> Incremental:
     for view in frames:
         now.add(view, solve_now=not at_once)
     now.catch_up()
@@ -73,7 +73,9 @@ def test_many_at_once_equal_one_by_one() -> None:
 def test_bare_cameras_too() -> None:
     true = synthetic.rig()
     observations = synthetic.observe(true, synthetic.poses(8, 3, near=0.3), noise=0.1, seed=1)
-    now = fed(Running(synthetic.BOARD, (synthetic.SIZE, synthetic.SIZE), MODEL, None, redundant=0), views(observations))
+    now = fed(
+        Incremental(synthetic.BOARD, (synthetic.SIZE, synthetic.SIZE), MODEL, None, redundant=0), views(observations)
+    )
     assert now.solution is not None
     assert sigmas_apart(now.solution, solve(observations, MODEL)) < 0.02  # mrcal's own stopping rule is looser
 
