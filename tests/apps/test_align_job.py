@@ -260,6 +260,27 @@ def test_mapped_gray_levels_are_stated_in_the_manifest(drive: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is counted in Linux's kilobytes")
+def test_memory_does_not_grow_with_the_recording(drive: Path, tmp_path: Path) -> None:
+    """Each job in a process of its own, one of them eight times as long as the other."""
+    most = []
+    for pairs in (200, 1600):
+        folder = tmp_path / str(pairs)
+        for role in ("dry", "wet"):
+            (folder / role).mkdir(parents=True)
+            for i in range(pairs):
+                os.link(drive / role / f"{i % PAIRS:04d}.png", folder / role / f"{i:06d}.png")
+        (folder / "rig").symlink_to(drive / "rig")
+        command = [sys.executable, "-m", "rainstereo.apps.cli", *words(folder, folder / "out")]
+        subprocess.run(command, check=True, capture_output=True, timeout=600)
+        report = json.loads((folder / "out" / "report.json").read_text())
+        assert report["pairs"] == pairs
+        most.append(report["memory_mb"]["this_process"])
+    assert most[1] < most[0] + 15, most  # names and times of 1400 more pairs; a decoded pair each would be 160 MB
+    assert most[1] < 1000
+
+
+@pytest.mark.slow
 def test_real_rainy_pairs_without_a_rig(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "raindrop" / "robotcar_rainy"
     command = ["align", "--dry", f"{folder}/right*.png", "--wet", f"{folder}/left*.png", "--out", str(tmp_path / "o")]
