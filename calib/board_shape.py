@@ -25,14 +25,13 @@ from rainstereo import pose
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib import refracted
 from rainstereo.calib.mrcal_versions import Layout, Problem
+from rainstereo.calib.problem_rig import rig_of
 from rainstereo.calib.refracted import Panels
 from rainstereo.calib.solve import Solution
 from rainstereo.calib.sought import seen_through
 from rainstereo.calib.state_covariance import regular_inverse
 from rainstereo.calib.uncertainty import Difference, infinity_error
-from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
-from rainstereo.rig import Rig
 from rainstereo.types import Array, Indices
 
 SHAPES = ("xy", "x3", "y3", "x2y", "xy2")
@@ -208,13 +207,8 @@ def _moved(problem: Problem, packed: Array, step: Array) -> Difference:
     """What a step of the state does to the wet pixel of a direction at infinity."""
     changed = problem.copy()
     versions.ingest(changed, packed + step[: len(packed)])
-    return infinity_error(_rig(changed), _rig(problem)).stereo if len(problem.intrinsics) == 2 else Difference(0.0, 0.0)
-
-
-def _rig(problem: Problem) -> Rig:
-    places = np.zeros(6), problem.rt_cam_ref[0]
-    dry, wet = (
-        Camera(problem.lensmodel, problem.intrinsics[i], int(problem.sizes[i, 0]), int(problem.sizes[i, 1]), places[i])
-        for i in range(2)
+    return (
+        infinity_error(rig_of(changed), rig_of(problem)).stereo
+        if len(problem.intrinsics) == 2
+        else Difference(0.0, 0.0)
     )
-    return Rig(dry, wet)

@@ -19,13 +19,12 @@ from rainstereo import pose, refraction
 from rainstereo.calib import adjust, joint, range_uncertainty, through_acrylic, uncertainty
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.checks import INFINITY_DOUBTFUL_PX, Finding, Severity
-from rainstereo.calib.mrcal_versions import Problem, SolveError
+from rainstereo.calib.mrcal_versions import SolveError
+from rainstereo.calib.problem_rig import rig_of
 from rainstereo.calib.refracted import Panels
 from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution
 from rainstereo.calib.sought import seen_through
-from rainstereo.camera import Camera
-from rainstereo.chamber import Chamber
 from rainstereo.rig import Rig
 from rainstereo.types import Array, Indices, Mask
 
@@ -150,14 +149,14 @@ def part(solution: Solution, kept: Mask) -> Solution:
     problem = adjust.without(solution.problem, ~kept)
     if solution.rig.chamber is None:
         versions.optimize(problem)
-        return replace(solution, problem=problem, rig=_rig(problem, None), rt_ref_board=problem.rt_ref_board)
+        return replace(solution, problem=problem, rig=rig_of(problem), rt_ref_board=problem.rt_ref_board)
     panels = solution.panels or Panels(Slab(solution.rig.chamber))
     seen = seen_through(solution.problem, panels)[kept[solution.problem.indices[:, 0]]]
     panels = replace(panels, frames=None if panels.frames is None else panels.frames[kept], ties=_ties(panels, kept))
     through_acrylic.refine(problem, seen, panels)
     estimate = None if solution.estimate is None else joint.judged(problem, seen, panels)
     return replace(
-        solution, problem=problem, rig=_rig(problem, panels.slab.chamber), rt_ref_board=problem.rt_ref_board,
+        solution, problem=problem, rig=rig_of(problem, panels.slab.chamber), rt_ref_board=problem.rt_ref_board,
         panels=panels, estimate=estimate,
     )  # fmt: skip
 
@@ -215,19 +214,8 @@ def wet_pixels(rig: Rig, dry: Array, distance: float) -> Array:
     rays = refraction.backproject(dry, rig.dry, rig.chamber)
     if np.isinf(distance):
         return rig.wet.project(rays.directions @ pose.rotation_matrix(rig.rt_wet_dry[:3]).T)
-    ahead = (rays.origins * rays.directions).sum(-1)
-    with np.errstate(invalid="ignore"):
-        length = np.sqrt(ahead**2 - (rays.origins**2).sum(-1) + distance**2) - ahead
-        points = rays.origins + np.where(length > 0, length, np.nan)[..., None] * rays.directions
+    points = rays.at(distance)
     return refraction.project(pose.transform(rig.rt_wet_dry, points), rig.wet, rig.chamber_in("wet"))[0]
-
-
-def _rig(problem: Problem, chamber: Chamber | None) -> Rig:
-    dry, wet = (
-        Camera(problem.lensmodel, k, int(w), int(h))
-        for k, (w, h) in zip(problem.intrinsics, problem.sizes, strict=True)
-    )
-    return Rig(dry, wet.with_pose(problem.rt_cam_ref[0]), chamber)
 
 
 def _middle(solution: Solution) -> Array:

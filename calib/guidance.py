@@ -20,6 +20,7 @@ from rainstereo.calib.board_candidates import Candidates
 from rainstereo.calib.far_directions import FarDirections, far_directions
 from rainstereo.calib.information import Information
 from rainstereo.calib.mrcal_versions import Problem
+from rainstereo.calib.problem_rig import rig_of
 from rainstereo.calib.solve import Solution
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
@@ -127,16 +128,6 @@ def _noise(problem: Problem, known: Information, covariance: Array) -> float:
     used = int(np.isfinite(off).sum())
     spent = float(np.sum(covariance * known.frames.sum(0))) + 6 * len(problem.rt_ref_board)
     return float(np.sqrt(np.nansum(off**2) / (used - spent))) if used > spent else np.inf
-
-
-def rig_of(problem: Problem, chamber: Chamber | None) -> Rig:
-    """The rig that a problem's state stands for."""
-    poses = np.zeros(6), problem.rt_cam_ref[0]
-    dry, wet = (
-        Camera(problem.lensmodel, problem.intrinsics[i], int(w), int(h), poses[i])
-        for i, (w, h) in enumerate(problem.sizes)
-    )
-    return Rig(dry, wet, chamber)
 
 
 def propose(

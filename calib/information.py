@@ -19,8 +19,6 @@ from rainstereo.calib.mrcal_versions import Layout, Problem
 from rainstereo.chamber import Chamber
 from rainstereo.types import Array
 
-AIR = Chamber((0.0, 0.0, 1.0), 1e3, (), ())
-"""Nothing in front of the cameras."""
 BATCH = 48
 """Hypothetical frames linearised at once; the normal equations grow with the square."""
 SINGULAR = 1e-12
@@ -51,7 +49,7 @@ def information(problem: Problem, chamber: Chamber | None) -> Information:
     chamber: what the corners are seen through, in the first camera's frame.
     """
     where = versions.layout(problem)
-    normal = refracted.normal_equations(problem, problem.observations[..., :2], chamber or AIR)
+    normal = refracted.normal_equations(problem, problem.observations[..., :2], chamber or refracted.AIR)
     shared = _shared(where)
     at = versions.linearize(problem)
     tied = at.jacobian[at.boards :][:, shared]
@@ -84,7 +82,7 @@ def _of_batch(problem: Problem, chamber: Chamber | None, poses: Array, weight: A
         spacing=spacing,
         lattice=None if problem.lattice is None else tuple(along[::step] for along in problem.lattice),
     )
-    normal = refracted.normal_equations(boards, observations[..., :2], chamber or AIR)
+    normal = refracted.normal_equations(boards, observations[..., :2], chamber or refracted.AIR)
     return _frames(normal, versions.layout(boards))
 
 

@@ -77,9 +77,7 @@ def _unknown(solution: Solution) -> list[Finding]:
     estimate, chamber = solution.estimate, solution.rig.chamber
     if estimate is None or chamber is None:
         return []
-    words = {"distance": "distance", "gaps": "gaps", "index": "index", "thickness": "thickness", "tilt": "tilt"}
-    kept = ", ".join(words[name] for name in chamber.nominal)
-    text = f"kept from the description, since boards cannot show it: {kept}"
+    text = f"kept from the description, since boards cannot show it: {', '.join(chamber.nominal)}"
     if "index" in chamber.nominal:
         T = sum(panel.thickness for panel in chamber.panels if np.isfinite(panel.thickness))
         n = max((panel.index for panel in chamber.panels), default=1.49)

@@ -25,6 +25,9 @@ from rainstereo.chamber import Chamber
 from rainstereo.refraction import Status
 from rainstereo.types import Array, Indices, Mask
 
+AIR = Chamber((0.0, 0.0, 1.0), 1e3, ())
+"""Nothing in front of the cameras."""
+
 
 class ChamberError(SolveError):
     """The chamber given and the corners do not go together."""
@@ -278,9 +281,6 @@ def _range(span: slice) -> Array:
     return np.arange(span.start, span.stop)
 
 
-_NOTHING = Chamber((0, 0, 1), 1.0, ())
-
-
 def _nothing(problem: Problem) -> Panels:
     """Panels that no frame was taken through."""
-    return Panels(Slab(_NOTHING), np.zeros(len(problem.rt_ref_board), dtype=np.bool_))
+    return Panels(Slab(AIR), np.zeros(len(problem.rt_ref_board), dtype=np.bool_))

@@ -17,7 +17,6 @@ from rainstereo.calib.mrcal_versions import Layout, Problem
 from rainstereo.calib.rotation import rotated_by
 from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution
-from rainstereo.calib.uncertainty import Covariance
 from rainstereo.camera import Camera
 from rainstereo.rig import ROLES, Role
 from rainstereo.types import Array, Mask
@@ -37,8 +36,8 @@ class View:
     by_state: Array
 
 
-def panels(solution: Solution, cov: Covariance | None = None) -> Slab | None:
-    """The solution's panels with the parameters that a covariance counts; None where there are no panels."""
+def panels(solution: Solution) -> Slab | None:
+    """The solution's panels, with those parameters that it estimated; None where there are no panels."""
     if solution.rig.chamber is None:
         return None
     if solution.estimate is not None:
@@ -79,12 +78,10 @@ def along(problem: Problem, slab: Slab | None, role: Role, pixels: Array, distan
     camera = Camera(problem.lensmodel, problem.intrinsics[index], *problem.sizes[index].tolist())
     inside = None if slab is None else slab.chamber.transformed(rt)
     rays = refraction.backproject(pixels, camera, inside)
-    ahead = (rays.origins * rays.directions).sum(-1)
+    points = rays.at(distance)
+    again, _ = refraction.project(points, camera, inside)  # no answer within the chamber, nor where the lens folds
     with np.errstate(invalid="ignore"):
-        length = np.sqrt(ahead**2 - (rays.origins**2).sum(-1) + distance**2) - ahead
-        points = rays.origins + length[:, None] * rays.directions
-        again, _ = refraction.project(points, camera, inside)  # no answer within the chamber, nor where the lens folds
-        seen = (length > 0) & (np.linalg.norm(again - pixels, axis=-1) < 1e-2)
+        seen = np.linalg.norm(again - pixels, axis=-1) < 1e-2
     return pose.transform(pose.invert(rt), points[seen]), seen
 
 

@@ -24,7 +24,8 @@ class DropOwners:
     A ray belongs to the drop in whose circle (of radius `reach`) its point of the face lies deepest: the one of
     smallest d^2 - reach^2, d the distance from the centre. Beside all circles it belongs, in the same sense, to one
     whose side it can meet at its own slope (`DropGrid` goes by the steepest ray of a block, so that there a ray
-    between drops may miss the one it meets). The order of the drops does not matter.
+    between drops may miss the one it meets). The order of the drops does not matter, unless two stand on the very same
+    circle: then it may belong to either.
     """
 
     centres: Tensor  # (B, D, 2)

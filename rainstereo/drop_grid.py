@@ -18,18 +18,22 @@ class DropGrid:
 
     A ray belongs to the drop in whose circle (of radius `reach`) its point of the face lies deepest: the one of
     smallest d^2 - reach^2, d the distance from the centre. So circles that overlap part along their common chord, and
-    the order of the drops does not matter. Beside all circles it belongs to the one it is closest to, in the same
-    sense, of those that it can meet: that stand no farther away than it moves along the face over their height.
+    the order of the drops does not matter (of two on the very same circle, the taller one counts). Beside all circles
+    it belongs to the one it is closest to, in the same sense, of those that it can meet: that stand no farther away
+    than it moves along the face over their height.
 
     margin: greatest slope, against the normal, of the rays that will ask.
     """
 
     def __init__(self, drops: dict[int, Drop], origin: Array, margin: float) -> None:
         self.margin = margin
-        self.numbers = np.array([*drops, NOBODY])
+        numbers = np.array(list(drops))
         centres = np.array([origin[:2] + np.asarray(drop.centre) for drop in drops.values()])
         reach = np.array([drop.reach for drop in drops.values()])
         top = np.array([drop.top for drop in drops.values()])
+        first = np.lexsort((reach, *centres.T, -top))  # of equals, `whose` takes the first
+        numbers, centres, reach, top = numbers[first], centres[first], reach[first], top[first]
+        self.numbers = np.append(numbers, NOBODY)
         wide = reach + margin * top
         self.table = np.concatenate([centres.T, [reach], [top]])
         self.low = (centres - wide[:, None]).min(0)

@@ -66,6 +66,14 @@ class Rays:
         yield self.origins
         yield self.directions
 
+    def at(self, distance: float) -> Array:
+        """Points of the rays, (..., 3), at a distance from the camera's centre, metres; NaN where a ray is farther."""
+        ahead = (self.origins * self.directions).sum(-1)
+        with np.errstate(invalid="ignore"):
+            length = np.sqrt(ahead**2 - (self.origins**2).sum(-1) + distance**2) - ahead
+            points: Array = self.origins + np.where(length > 0, length, np.nan)[..., None] * self.directions
+        return points
+
 
 def project(points: Array, camera: Camera, chamber: Chamber | None = None) -> tuple[Array, types.Status]:
     """Where the camera sees points through the chamber.

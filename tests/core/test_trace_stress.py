@@ -125,6 +125,16 @@ def test_the_order_of_drops_does_not_matter(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(a.source, b.source)
 
 
+def test_of_two_drops_on_one_circle_the_taller_counts() -> None:
+    low, high = cap(20, radius=2e-3), cap(50, radius=2e-3)
+    alone = trace(GRID, [high], CAMERA, pane(), 5.0)
+    assert (alone.status == 0).any()
+    for both in ([low, high], [high, low]):
+        found = trace(GRID, both, CAMERA, pane(), 5.0)
+        np.testing.assert_array_equal(found.status, alone.status)
+        np.testing.assert_allclose(found.source, alone.source, rtol=1e-12)
+
+
 def test_touching_drops(rng: np.random.Generator) -> None:
     drops = [cap(50, radius=2e-3, centre=(x, 0.0)) for x in (-0.004, 0.0, 0.004)]
     t = trace(GRID, drops, CAMERA, pane(), 5.0)
