@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import tempfile
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 import torch
 
-from rainstereo.apps import bench_derain_skip
+from rainstereo.apps import bench_derain_cuda, bench_derain_skip
 from rainstereo.apps.bench_harness import Stage, Target, Variant, Work
 from rainstereo.model import checkpoint, export
 from rainstereo.model.generator import Generator, GeneratorConfig
@@ -51,6 +52,8 @@ def build(seed: int, quick: bool, images: Path | None = None) -> Stage:
         _tile_work(shipped, cv2.resize(views[0].scattered, (2 * width, 2 * height)), quick),
         *bench_derain_skip.video_works(shipped, views[0], seed),
     ]
+    if torch.cuda.is_available():
+        works += _on_cuda(module, full, views[0].scattered, not quick)
     return Stage(
         "derain",
         "de-raining a frame",
@@ -70,6 +73,17 @@ def build(seed: int, quick: bool, images: Path | None = None) -> Stage:
             "bf16 is emulated on processors without AVX512-BF16 or AMX, and is then slower than float32.",
         ),
     )  # fmt: skip
+
+
+def _on_cuda(module: Generator, full: Image, scattered: Image, promised: bool) -> list[Work]:
+    """The works of `bench_derain_cuda` at the stage's size, and at twice that."""
+    papers, shipped = partial(copy.deepcopy, _random(bench_derain_cuda.PAPERS)), partial(copy.deepcopy, module)
+    found = []
+    for scale in (1, 2):
+        size = scale * full.shape[1], scale * full.shape[0]
+        frames, fewer = (bench_derain_cuda.copies(cv2.resize(image, size)) for image in (full, scattered))
+        found += bench_derain_cuda.works(shipped, papers, frames, fewer, torch.device("cuda"), promised)
+    return found
 
 
 def _random(config: GeneratorConfig) -> Generator:
@@ -104,7 +118,7 @@ def _size_work(name: str, module: Generator, shipped: Network, image: Image, cor
 
     ours, bare = "float32, torch", "bare network call"
     error = partial(_levels, truth=truth)
-    half = TorchNetwork(_copy(module), "cpu", "bf16")
+    half = TorchNetwork(copy.deepcopy(module), "cpu", "bf16")
     variants = [
         Variant(bare, lambda: shipped(tensor), lambda _: 0.0, note="float32, torch; the yardstick"),
         Variant(ours, run(shipped, False), error, True, "skips nothing"),
@@ -118,12 +132,6 @@ def _size_work(name: str, module: Generator, shipped: Network, image: Image, cor
         name, f"{width} x {height}, drops all over", "The model of the package.", tuple(variants), ours, "gray levels",
         "largest difference to float32 without skipping", 1, "frames", tuple(targets),
     )  # fmt: skip
-
-
-def _copy(module: Generator) -> Generator:
-    made = module.config.build()
-    made.load_state_dict(module.state_dict())
-    return made.eval()
 
 
 def _width_work(image: Image, quick: bool) -> Work:

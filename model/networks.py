@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -14,6 +16,8 @@ from rainstereo.model.image_batch import padded
 from rainstereo.model.receptive_field import halo
 
 PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16, "float16": torch.float16}
+MOST_SHAPES = 256
+"""Of images, that are remembered."""
 WITHOUT_A_CARD = 512
 """Halo of a network that does not say how far it looks, in pixels."""
 
@@ -54,12 +58,22 @@ class TorchNetwork:
         self.kind, self.name = kind, f"torch {self.precision} on {self.device}"
         able = isinstance(module, Generator) and supported(module.config)
         self.cells = CellGenerator(self.module, kind) if able else None
+        self._before: set[tuple[int, ...]] = set()
 
     def __call__(self, images: Tensor) -> Tensor:
         """The restored images, on the same device."""
-        with torch.inference_mode():
+        with torch.inference_mode(), self._choosing(tuple(images.shape)):
             given = images.to(self.device, self.kind).contiguous(memory_format=torch.channels_last)
             return cast(Tensor, self.module(given)).float()
+
+    def _choosing(self, shape: tuple[int, ...]) -> AbstractContextManager[None]:
+        """On a CUDA device, cuDNN tries its ways to convolve, once, for a shape that comes again: a stream's frames."""
+        if self.device.type != "cuda":
+            return nullcontext()
+        again = shape in self._before
+        if len(self._before) < MOST_SHAPES:
+            self._before.add(shape)
+        return cudnn_chooses() if again else nullcontext()
 
 
 class OnnxNetwork:
@@ -92,6 +106,18 @@ class OnnxNetwork:
         given = padded(images, self.multiple, self.smallest)
         found = self.session.run(None, {self.input: given.contiguous().numpy()})[0]
         return torch.from_numpy(found[:, :, :height, :width])
+
+
+@contextmanager
+def cudnn_chooses() -> Iterator[None]:
+    """Within it, cuDNN measures its algorithms for each new shape and keeps to the fastest."""
+    backend: Any = torch.backends.cudnn  # whose settings have no types
+    before = backend.benchmark
+    backend.benchmark = True
+    try:
+        yield
+    finally:
+        backend.benchmark = before
 
 
 def reach(module: nn.Module) -> tuple[int, int, bool]:

@@ -6,7 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rainstereo.types import Image
+from rainstereo.types import Array, Image
+
+RAW = {"uint8": torch.uint8, "uint16": torch.int32}
+"""What an image's values are as a tensor; torch computes little with unsigned 16 bits."""
 
 
 def check(image: Image) -> None:
@@ -23,20 +26,17 @@ def check(image: Image) -> None:
 
 def to_rgb(image: Image, device: torch.device) -> Tensor:
     """(1, 3, H, W) float32 in 0..1; gray is repeated."""
-    if image.dtype == np.uint16:  # torch on the processor computes little with unsigned 16 bits
-        tensor = torch.from_numpy(image.astype(np.int32)).to(device)
-    else:
-        own = np.ascontiguousarray(image)
-        tensor = torch.from_numpy(own if own.flags.writeable else own.copy()).to(device)
-    rgb = tensor.expand(3, *tensor.shape) if image.ndim == 2 else tensor.permute(2, 0, 1).flip(0)
-    return rgb.float().div_(float(np.iinfo(image.dtype).max)).unsqueeze(0)
+    return to_batch(image[None], device)
 
 
 def to_batch(images: Image, device: torch.device) -> Tensor:
     """(N, H, W[, 3]) images of one size as (N, 3, H, W) float32 in 0..1."""
-    count, height, width = images.shape[:3]
-    tall = to_rgb(images.reshape(count * height, width, *images.shape[3:]), device)
-    return tall.view(3, count, height, width).transpose(0, 1)
+    if images.dtype == np.uint16:
+        raw = torch.from_numpy(images.astype(np.int32))
+    else:
+        own = np.ascontiguousarray(images)
+        raw = torch.from_numpy(own if own.flags.writeable else own.copy())
+    return unpacked(raw.to(device), _most(images))
 
 
 def from_rgb(rgb: Tensor, like: Image) -> Image:
@@ -47,10 +47,26 @@ def from_rgb(rgb: Tensor, like: Image) -> Image:
 
 def from_batch(rgb: Tensor, like: Image) -> Image:
     """(N, 3, H, W) in 0..1 as (N, H, W[, 3]) images of the type and channels of others."""
-    most = int(np.iinfo(like.dtype).max)
-    kind = torch.uint8 if like.dtype == np.uint8 else torch.int32
-    values = rgb.float() if like.ndim == 4 else rgb.float().mean(1, keepdim=True)
-    levels = values.mul(most).round_().clamp_(0, most).to(kind).permute(0, 2, 3, 1)
-    levels = levels.flip(3) if like.ndim == 4 else levels[..., 0]
+    levels = packed(rgb, _most(like), like.ndim == 3, RAW[like.dtype.name])
     found: Image = np.ascontiguousarray(levels.cpu().numpy()).astype(like.dtype, copy=False)
     return found
+
+
+def unpacked(raw: Tensor, most: int) -> Tensor:
+    """(N, H, W[, 3]) values up to `most`, gray or BGR, as (N, 3, H, W) float32 RGB in 0..1, on the tensor's device."""
+    if raw.ndim == 3:
+        rgb = raw.unsqueeze(1).expand(-1, 3, -1, -1)
+    else:  # planes are turned about one by one: cheaper than a flip of the last axis
+        rgb = torch.stack([raw[..., channel] for channel in (2, 1, 0)], 1)
+    return rgb.float().div_(float(most))
+
+
+def packed(rgb: Tensor, most: int, gray: bool, kind: torch.dtype) -> Tensor:
+    """What `unpacked` unpacks, rounded, on the tensor's device; gray is the mean of the channels."""
+    values = rgb.float().mean(1, keepdim=True) if gray else rgb.float()
+    levels = values.mul(most).round_().clamp_(0, most).to(kind)
+    return levels[:, 0] if gray else torch.stack([levels[:, channel] for channel in (2, 1, 0)], 3)
+
+
+def _most(image: Image | Array) -> int:
+    return int(np.iinfo(image.dtype).max)

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
@@ -31,6 +32,7 @@ from rainstereo.model.image_batch import INPUT
 from rainstereo.model.networks import Network, OnnxNetwork, TorchNetwork, pick_device
 from rainstereo.model.pixels import check, from_batch, from_rgb, to_batch, to_rgb
 from rainstereo.model.tiles import Grid, Rect, Rows, coarser, covering, ramped, strips
+from rainstereo.model.whole_frames import WholeFrames
 from rainstereo.types import Array, Image, Mask
 
 Backend = Literal["torch", "onnx"]
@@ -88,7 +90,8 @@ class Restorer:
                 f"of at least {4 * CELL} and at least {1 << 16} pixels at once"
             )
         self.network = network or _network(checkpoint, device, precision, backend)
-        self.detector = (detector or Detector.shipped("cpu", threshold, certain)) if skip else None
+        looks_on = self.network.device if self.network.device.type == "cuda" else "cpu"
+        self.detector = (detector or Detector.shipped(looks_on, threshold, certain)) if skip else None
         step = self.network.multiple
         self.step = step if step % CELL == 0 else int(np.lcm(step, CELL))
         self.by_cells: CellGenerator | None = getattr(self.network, "cells", None)
@@ -127,12 +130,30 @@ class Restorer:
             else:
                 found[i] = self.with_cells(image, cells)
         for alike in whole.values():
-            batch = torch.cat([to_rgb(images[i], self.network.device) for i, _ in alike])
+            batch = to_batch(np.stack([images[i] for i, _ in alike]), self.network.device)
             for (i, cells), rgb in zip(alike, self.network(batch), strict=True):
                 out = images[i].copy()
                 _pasted(out, from_rgb(rgb, out), _whole(out), cells)
                 found[i] = Restored(out, float(cells.mean()), 1.0)
         return [found[i] for i in range(len(images))]
+
+    def stream(self, frames: Iterable[Image], batch: int = 1) -> Iterator[Image]:
+        """Frames, restored in order. Where nothing is skipped, batches of one size are computed together, and on a
+        CUDA device the next ones are sent before the last have come back; frames that need tiles come one by one."""
+        if self.detector is not None:
+            yield from (self.restored(frame).image for frame in frames)
+            return
+        whole = WholeFrames(self.network, batch)
+
+        def small_enough(frame: Image) -> bool:
+            check(frame)
+            return _area(frame) <= self.max_pixels
+
+        for small, run in groupby(frames, small_enough):
+            if small:
+                yield from whole(run)
+            else:
+                yield from map(self, run)
 
     def rows(
         self, read: Rows, size: tuple[int, int], told: Callable[[int, int], None] = lambda done, total: None

@@ -1,19 +1,22 @@
 """Benchmark stage `derain`, its works on skipping: they run, and what they call an error is one."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from rainstereo import imagefile
+from rainstereo.apps import bench_derain_cuda as cuda
 from rainstereo.apps import bench_derain_skip as skip
 from rainstereo.apps.bench_harness import measure
 from rainstereo.apps.cli import main
 from rainstereo.apps.rain_settings import psnr
 from rainstereo.model.restore import Restorer
-from tests.model.small_restorer import CONFIG, network, picture
+from tests.model.small_restorer import CONFIG, generator, network, picture
 
 ZEROS = replace(CONFIG, padding="zeros", normalisation="none", patch=4)
 SIZE = (160, 112)
@@ -71,3 +74,28 @@ def test_scenes_come_from_a_photograph_or_a_folder(tmp_path: Path, capsys: pytes
         skip.views(SIZE, 0, tmp_path / "none", True)
     assert main(["bench", "warp", "--images", str(tmp_path)]) == 2
     assert "is for the stage derain" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("where", ["cpu", "cuda"])
+def test_frames_go_through_a_device_and_back(where: str) -> None:
+    if where == "cuda" and not torch.cuda.is_available():
+        pytest.skip("this machine has no CUDA device")
+    frames = [picture(i, (48, 64)) for i in range(3)]
+    modules = [partial(generator, config) for config in (ZEROS, CONFIG)]
+    paper, own = cuda.works(*modules, frames, frames, torch.device(where), True)
+    assert paper.items == len(frames)
+    assert not paper.targets  # which are for larger frames
+    assert not any("skipping" in variant.name for variant in paper.variants)
+    outcome = measure(own, 1)
+    assert outcome["bf16, stream"].error == outcome["bf16, Restorer, each frame for itself"].error > 0
+    assert outcome[f"float32, stream in batches of {cuda.BATCH}"].error <= 1
+    assert "bf16, skipping, each frame for itself" in {m.name for m in outcome.measurements}
+
+
+def test_the_paper_is_promised_at_its_two_sizes() -> None:
+    frames = cuda.copies(picture(0, (480, 640)))
+    assert len(frames) == cuda.FRAMES[480]
+    assert not np.array_equal(frames[0], frames[1])
+    small = replace(CONFIG, base_channels=1, blocks=0, patch=16)
+    paper, _ = cuda.works(*[partial(generator, small)] * 2, frames[:2], frames[:2], torch.device("cpu"), True)
+    assert [target.limit for target in paper.targets] == [2 / 100] * 2
