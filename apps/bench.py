@@ -33,6 +33,7 @@ STAGES: dict[str, str] = {
     "select": "rainstereo.apps.bench_select",
     "train": "rainstereo.apps.bench_train",
     "derain": "rainstereo.apps.bench_derain",
+    "cuda": "rainstereo.apps.bench_cuda",
 }
 """Stage -> module with `build(seed, quick) -> Stage`."""
 
@@ -47,7 +48,7 @@ class Options:
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
     """What: refraction, warp, calibration, slab, cavity, guidance, drops, rain, align, record, select, train, derain,
-    or all."""
+    cuda (where there is a GPU), or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15
@@ -68,7 +69,9 @@ def run(options: Options) -> int:
     """Run the stages that are asked for. Returns 0, whether or not targets are met: figures are no failure."""
     names = [options.stage]
     if options.stage == "all":
-        names = [name for name in STAGES if name != "cavity" or options.cavity is not None]
+        left = {"cavity"} if options.cavity is None else set()
+        left |= set() if _has_cuda() else {"cuda"}
+        names = [name for name in STAGES if name not in left]
     for name in names:
         if name not in STAGES:
             raise ValueError(f"there is no stage {name!r}; expected one of {', '.join(STAGES)}, or all")
@@ -84,6 +87,12 @@ def run(options: Options) -> int:
     record["machine"] = machine()
     record.write(options.out / "report.json")
     return 0
+
+
+def _has_cuda() -> bool:
+    from rainstereo.apps import bench_cuda  # which needs torch
+
+    return bench_cuda.is_there()
 
 
 def command(options: Options, stage: str) -> str:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import torch
 
-from rainstereo.apps import bench_derain_cuda, bench_derain_skip
+from rainstereo.apps import bench_derain_skip
 from rainstereo.apps.bench_harness import Stage, Target, Variant, Work
 from rainstereo.model import checkpoint, export
 from rainstereo.model.generator import Generator, GeneratorConfig
@@ -52,8 +52,6 @@ def build(seed: int, quick: bool, images: Path | None = None) -> Stage:
         _tile_work(shipped, cv2.resize(views[0].scattered, (2 * width, 2 * height)), quick),
         *bench_derain_skip.video_works(shipped, views[0], seed),
     ]
-    if torch.cuda.is_available():
-        works += _on_cuda(module, full, views[0].scattered, not quick)
     return Stage(
         "derain",
         "de-raining a frame",
@@ -73,17 +71,6 @@ def build(seed: int, quick: bool, images: Path | None = None) -> Stage:
             "bf16 is emulated on processors without AVX512-BF16 or AMX, and is then slower than float32.",
         ),
     )  # fmt: skip
-
-
-def _on_cuda(module: Generator, full: Image, scattered: Image, promised: bool) -> list[Work]:
-    """The works of `bench_derain_cuda` at the stage's size, and at twice that."""
-    papers, shipped = partial(copy.deepcopy, _random(bench_derain_cuda.PAPERS)), partial(copy.deepcopy, module)
-    found = []
-    for scale in (1, 2):
-        size = scale * full.shape[1], scale * full.shape[0]
-        frames, fewer = (bench_derain_cuda.copies(cv2.resize(image, size)) for image in (full, scattered))
-        found += bench_derain_cuda.works(shipped, papers, frames, fewer, torch.device("cuda"), promised)
-    return found
 
 
 def _random(config: GeneratorConfig) -> Generator:

@@ -1,4 +1,4 @@
-"""Of benchmark stage `derain`: decoded frames in the computer's memory to such frames, by way of a CUDA device."""
+"""Of benchmark stage `cuda`: decoded frames in the computer's memory to such frames, by way of a CUDA device."""
 
 from __future__ import annotations
 
@@ -94,6 +94,13 @@ def _work(
         name, title, what, tuple(variants), several, "gray levels", "largest difference to float32", len(frames),
         "frames", limits,
     )  # fmt: skip
+
+
+def papers() -> Generator:
+    """The paper's network, with random weights."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return PAPERS.build().eval()
 
 
 def copies(frame: Image) -> list[Image]:

@@ -58,7 +58,7 @@ def build(seed: int, quick: bool) -> Stage:
             _moving_work(camera, pane, image, seed, not quick),
             _blurred_work(camera, pane, image, seed, quick),
             _merged_work(camera, pane, image, seed, not quick),
-            _batch_work(seed, quick),
+            batch_work(seed, quick),
         ),
         {
             "camera": f"pinhole {width}x{height}, f {f:.0f} px; with a lens: 4.5 mm at F/1.4, focused at infinity",
@@ -253,7 +253,7 @@ def _cap_height(drops: Drops, i: int, x: Array, y: Array) -> Array:
 # -- batches -------------------------------------------------------------------------------------------------------
 
 
-def _batch_work(seed: int, quick: bool) -> Work:
+def batch_work(seed: int, quick: bool) -> Work:
     """The augmentation beside kornia's own rain and a bare grid_sample."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     side, count = (128, 2) if quick else (IMAGE_SIDE, 512 if device == "cuda" else BATCH)

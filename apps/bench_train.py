@@ -24,6 +24,7 @@ from rainstereo.model.recipe import Recipe, parse
 from rainstereo.model.train_step import Trainer
 
 STEPS = 3
+CPU = torch.device("cpu")
 PIXELS = {"lambda_adversarial": 0.0, "lambda_perceptual": 0.0, "lambda_msadv": 0.0, "lambda_pixel": 1.0}
 PAPER = {"lambda_perceptual": 0.0}
 
@@ -36,8 +37,8 @@ def build(seed: int, quick: bool) -> Stage:
         "training",
         f"{STEPS} steps on windows of {side} x {side}, batch 2, the paper's generator and discriminator with "
         f"{base} base channels, beside a loop written out in plain PyTorch; and how long the data takes.",
-        (_step_work("pixel", PIXELS, side, base, seed, not quick),
-         _step_work("adversarial", PAPER, side, base, seed, not quick),
+        (step_work("pixel", PIXELS, side, base, seed, not quick),
+         step_work("adversarial", PAPER, side, base, seed, not quick),
          _data_work(side, base, seed, not quick)),
         {"window": side, "batch": 2, "base channels": base, "seed": seed},
         (
@@ -57,15 +58,18 @@ def _recipe(weights: dict[str, float], side: int, base: int, seed: int) -> Recip
     })  # fmt: skip
 
 
-def _batch(side: int, seed: int) -> Batch:
+def _batch(side: int, seed: int, device: torch.device = CPU) -> Batch:
     draws = torch.Generator().manual_seed(seed)
-    rainy, clear = (torch.rand(2, 3, side, side, generator=draws) for _ in range(2))
-    return Batch(rainy, clear, torch.ones(2, 1, side, side), (0, 1), ("a", "b"))
+    rainy, clear = (torch.rand(2, 3, side, side, generator=draws).to(device) for _ in range(2))
+    return Batch(rainy, clear, torch.ones(2, 1, side, side, device=device), (0, 1), ("a", "b"))
 
 
-def _step_work(name: str, weights: dict[str, float], side: int, base: int, seed: int, promised: bool) -> Work:
-    batch, recipe = _batch(side, seed), _recipe(weights, side, base, seed)
-    trainer, plain = Trainer(recipe, torch.device("cpu")), _plain(recipe)
+def step_work(
+    name: str, weights: dict[str, float], side: int, base: int, seed: int, promised: bool, device: torch.device = CPU
+) -> Work:
+    """A few steps of ours, and of a plain loop, on a device."""
+    batch, recipe = _batch(side, seed, device), _recipe(weights, side, base, seed)
+    trainer, plain = Trainer(recipe, device), _plain(recipe, device)
 
     def ours() -> float:
         return next(trainer.step(batch, 0.0).losses["total"] for _ in range(STEPS))
@@ -73,7 +77,7 @@ def _step_work(name: str, weights: dict[str, float], side: int, base: int, seed:
     def theirs() -> float:
         return next(plain(batch) for _ in range(STEPS))
 
-    first = _plain(recipe)(batch)
+    first = _plain(recipe, device)(batch)
     titles = {"pixel": "Mean absolute difference alone", "adversarial": "Adversarial and discriminator-feature losses"}
     return Work(
         name, titles[name], "Generator, discriminator where there is one, Adam.",
@@ -84,18 +88,15 @@ def _step_work(name: str, weights: dict[str, float], side: int, base: int, seed:
     )  # fmt: skip
 
 
-def _plain(recipe: Recipe) -> Callable[[Batch], float]:
+def _plain(recipe: Recipe, device: torch.device) -> Callable[[Batch], float]:
     """A loop as one would write it."""
-    torch.manual_seed(recipe.seed)
-    generator = Trainer(recipe, torch.device("cpu")).config.build()
-    torch.manual_seed(recipe.seed)
-    generator.load_state_dict(Trainer(recipe, torch.device("cpu")).generator.state_dict())
+    ours = Trainer(recipe, device)
+    generator = ours.config.build().to(device)
+    generator.load_state_dict(ours.generator.state_dict())
     adversarial = recipe.losses.need_discriminator
-    critic = recipe.discriminator.build() if adversarial else None
-    if critic is not None:
-        twin = Trainer(recipe, torch.device("cpu")).discriminator
-        assert twin is not None  # noqa: S101
-        critic.load_state_dict(twin.state_dict())
+    critic = recipe.discriminator.build().to(device) if adversarial else None
+    if critic is not None and ours.discriminator is not None:
+        critic.load_state_dict(ours.discriminator.state_dict())
     g = torch.optim.Adam(generator.parameters(), 2e-4, (0.5, 0.999))
     d = None if critic is None else torch.optim.Adam(critic.parameters(), 2e-4, (0.5, 0.999))
     loss_of = GeneratorLoss(LossWeights(**dataclasses.asdict(recipe.losses)))
@@ -125,7 +126,7 @@ def _data_work(side: int, base: int, seed: int, promised: bool) -> Work:
     recipe = _recipe(PIXELS, side, base, seed)
     items = [Item("a", folder / "clear.png", (folder / "rainy.png",))]
     windows = Windows(items, recipe.data, recipe.rain, recipe.augment, seed)
-    trainer, batch = Trainer(recipe, torch.device("cpu")), _batch(side, seed)
+    trainer, batch = Trainer(recipe, CPU), _batch(side, seed)
 
     def read() -> Any:
         return [collate([windows[2 * i], windows[2 * i + 1]]) for i in range(STEPS)]

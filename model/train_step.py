@@ -159,7 +159,9 @@ class Trainer:
                 self.scaler.scale(found["total"] / len(parts)).backward()
             for name, loss in found.items():
                 losses[name] = losses.get(name, 0) + loss.detach() / len(parts)
-        return {name: float(loss) for name, loss in losses.items()}, self._update(self.generator_optimizer, rate)
+        good = self._update(self.generator_optimizer, rate)
+        values = torch.stack([loss.float() for loss in losses.values()]).tolist()  # a device is waited for once
+        return dict(zip(losses, values, strict=True)), good
 
     def _discriminated(self, clear: Tensor, derained: Tensor, rainy: Tensor) -> Tensor:
         return discriminator_loss(self._run_discriminator, clear, derained, rainy, self.recipe.losses.adversary)
