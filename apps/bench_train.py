@@ -58,17 +58,17 @@ def _recipe(weights: dict[str, float], side: int, base: int, seed: int) -> Recip
     })  # fmt: skip
 
 
-def _batch(side: int, seed: int, device: torch.device = CPU) -> Batch:
+def _batch(side: int, seed: int) -> Batch:
     draws = torch.Generator().manual_seed(seed)
-    rainy, clear = (torch.rand(2, 3, side, side, generator=draws).to(device) for _ in range(2))
-    return Batch(rainy, clear, torch.ones(2, 1, side, side, device=device), (0, 1), ("a", "b"))
+    rainy, clear = (torch.rand(2, 3, side, side, generator=draws) for _ in range(2))
+    return Batch(rainy, clear, torch.ones(2, 1, side, side), (0, 1), ("a", "b"))
 
 
 def step_work(
     name: str, weights: dict[str, float], side: int, base: int, seed: int, promised: bool, device: torch.device = CPU
 ) -> Work:
     """A few steps of ours, and of a plain loop, on a device."""
-    batch, recipe = _batch(side, seed, device), _recipe(weights, side, base, seed)
+    batch, recipe = _batch(side, seed), _recipe(weights, side, base, seed)
     trainer, plain = Trainer(recipe, device), _plain(recipe, device)
 
     def ours() -> float:
@@ -103,13 +103,14 @@ def _plain(recipe: Recipe, device: torch.device) -> Callable[[Batch], float]:
     pool = DerainedPool(50, recipe.seed)
 
     def step(batch: Batch) -> float:
-        derained = generator(batch.rainy)
+        rainy, clear = batch.rainy.to(device), batch.clear.to(device)
+        derained = generator(rainy)
         if critic is not None and d is not None:
             d.zero_grad()
-            discriminator_loss(critic, batch.clear, pool.query(derained)).backward()  # type: ignore[no-untyped-call]
+            discriminator_loss(critic, clear, pool.query(derained)).backward()  # type: ignore[no-untyped-call]
             d.step()
         g.zero_grad()
-        loss = loss_of(batch.clear, derained, critic)["total"]
+        loss = loss_of(clear, derained, critic)["total"]
         loss.backward()
         g.step()
         return float(loss.detach())

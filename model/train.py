@@ -217,8 +217,7 @@ def _look_for_shifts(recipe: Recipe, items: list[Item], listener: Listener) -> N
 def _device(recipe: Recipe, found: str) -> torch.device:
     name = found if recipe.compute.device == "auto" else recipe.compute.device
     try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
+        device = torch.empty(1, device=name).device  # by its number, also where none was given
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"compute.device {name!r} cannot be used here: {error}; try 'auto' or 'cpu'") from error
     if device.type == "cuda":

@@ -27,6 +27,8 @@ from rainstereo.model.vgg import VggFeatures
 
 Parts: TypeAlias = list[tuple[Tensor, Tensor]]
 """Rainy and clear images of the parts that a batch is taken in."""
+Found: TypeAlias = tuple[dict[str, Tensor], Tensor]
+"""Losses by name, and whether all was good so far, on the device."""
 
 PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16}
 STEP_SEED = 3
@@ -102,30 +104,32 @@ class Trainer:
         torch.manual_seed(int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1)))
         rate = self.rate(progress)
         self.done += 1
-        rainy, clear = self._moved(batch.rainy), self._moved(batch.clear)
-        if not self._everywhere(bool(torch.isfinite(rainy).all() & torch.isfinite(clear).all())):
+        if not self._everywhere(bool(torch.isfinite(batch.rainy).all() & torch.isfinite(batch.clear).all())):
             self.skipped += 1
             return Stepped(skipped="values that are not finite")
+        rainy, clear = self._moved(batch.rainy), self._moved(batch.clear)
         count = self.recipe.optimizer.accumulate
         parts = list(zip(rainy.chunk(count), clear.chunk(count), strict=True))
         # in one part, both networks learn from one pass of the generator; in several, keeping all passes would take the
         # memory that parts are to save
         first = [self._derained(parts[0][0])] if count == 1 else []
-        losses: dict[str, float] = {}
-        good = True
+        losses: dict[str, Tensor] = {}
+        good = torch.ones((), dtype=torch.bool, device=self.device)
         if self.discriminator is not None:
-            losses, good = self._discriminator_step(parts, first, rate)
-        if good:
-            found, good = self._generator_step(parts, first, rate)
-            losses |= found
+            losses, good = self._discriminator_step(parts, first, rate, good)
+        found, good = self._generator_step(parts, first, rate, good)
+        losses |= found
         self.scaler.update()
-        if not good:
+        # a device is waited for here, and only here
+        *values, went_well = torch.stack([*(loss.float() for loss in losses.values()), good.float()]).tolist()
+        told = dict(zip(losses, values, strict=True))
+        if not went_well:
             self.skipped += 1
-            return Stepped(losses, "gradients that are not finite")
+            return Stepped(told, "gradients that are not finite")
         self._follow()
-        return Stepped(losses)
+        return Stepped(told)
 
-    def _discriminator_step(self, parts: Parts, first: list[Tensor], rate: float) -> tuple[dict[str, float], bool]:
+    def _discriminator_step(self, parts: Parts, first: list[Tensor], rate: float, good: Tensor) -> Found:
         """L_disc of clear images and of derained ones from the pool."""
         total = torch.zeros((), device=self.device)
         size = len(parts[0][0])
@@ -144,9 +148,9 @@ class Trainer:
                     self.discriminator_optimizer.zero_grad()
                 self.scaler.scale(loss).backward()  # type: ignore[no-untyped-call]
             total += loss.detach()
-        return {"discriminator": float(total)}, self._update(self.discriminator_optimizer, rate)
+        return {"discriminator": total}, self._update(self.discriminator_optimizer, rate, good)
 
-    def _generator_step(self, parts: Parts, first: list[Tensor], rate: float) -> tuple[dict[str, float], bool]:
+    def _generator_step(self, parts: Parts, first: list[Tensor], rate: float, good: Tensor) -> Found:
         """L_gen, against the discriminator that has just learnt."""
         losses: dict[str, Tensor] = {}
         for i, (rainy, clear) in enumerate(parts):
@@ -159,9 +163,7 @@ class Trainer:
                 self.scaler.scale(found["total"] / len(parts)).backward()
             for name, loss in found.items():
                 losses[name] = losses.get(name, 0) + loss.detach() / len(parts)
-        good = self._update(self.generator_optimizer, rate)
-        values = torch.stack([loss.float() for loss in losses.values()]).tolist()  # a device is waited for once
-        return dict(zip(losses, values, strict=True)), good
+        return losses, self._update(self.generator_optimizer, rate, good)
 
     def _discriminated(self, clear: Tensor, derained: Tensor, rainy: Tensor) -> Tensor:
         return discriminator_loss(self._run_discriminator, clear, derained, rainy, self.recipe.losses.adversary)
@@ -230,21 +232,27 @@ class Trainer:
         torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MIN)
         return bool(flag.item())
 
-    def _update(self, optimizer: torch.optim.Adam, rate: float) -> bool:
-        """Change the weights, unless a gradient is not finite. Gradients are the same in all processes, so is this."""
-        gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-        good = True
+    def _update(self, optimizer: torch.optim.Adam, rate: float, good: Tensor) -> Tensor:
+        """Change the weights, unless a gradient is not finite, or not all was good before; whether so, on the device.
+
+        Gradients are the same in all processes, so is this.
+        """
         if self._autocast is not torch.float16 or self.recipe.optimizer.clip:
             self.scaler.unscale_(optimizer)
-            norm = nn.utils.get_total_norm(gradients)
-            # too large for half precision happens now and then: the scaler then leaves the weights alone
-            good = self._autocast is torch.float16 or bool(norm.isfinite())
-            if self.recipe.optimizer.clip and good:
+            norm = nn.utils.get_total_norm([p.grad for p in self._weights(optimizer) if p.grad is not None])
+            if self.recipe.optimizer.clip:
                 nn.utils.clip_grads_with_norm_(self._weights(optimizer), self.recipe.optimizer.clip, norm)
-        if good:
-            for group in optimizer.param_groups:
-                group["lr"] = rate
+            # too large for half precision happens now and then: the scaler then leaves the weights alone
+            good = good if self._autocast is torch.float16 else good & norm.isfinite()
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        if self._autocast is torch.float16:
             self.scaler.step(optimizer)
+        elif optimizer.defaults["fused"]:
+            optimizer.found_inf = (~good).float()  # type: ignore[attr-defined]  # as the scaler tells it
+            optimizer.step()
+        elif good:
+            optimizer.step()
         return good
 
     @staticmethod

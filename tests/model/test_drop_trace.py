@@ -35,10 +35,13 @@ DISTORTED = Camera(
 )
 
 
-def agree(t: Trace, expected: core.Trace, near_critical: float = 0.0, steep: bool = False) -> int:
+def agree(
+    t: Trace, expected: core.Trace, near_critical: float = 0.0, steep: bool = False, nudged: core.Trace | None = None
+) -> int:
     """Compare a trace with numpy's; the number of pixels compared within the frame.
 
     near_critical: share of the pixels that may differ in status, where rays are at a limit but for rounding.
+    nudged: numpy's trace of pixels that are each off by their last bit; where that changes much, so may other rounding.
     """
     single = expected.source.dtype == np.float32
     source, share, status = (c.detach().cpu().numpy() for c in (t.source, t.transmittance, t.status))
@@ -54,7 +57,10 @@ def agree(t: Trace, expected: core.Trace, near_critical: float = 0.0, steep: boo
         both = (status == 0) & (expected.status == 0) & ((expected.source >= 0) & (expected.source <= size)).all(-1)
     if not (single and steep):
         assert np.abs(source - expected.source)[both].max(initial=0) <= (0.02 if single else 1e-9)
-        assert np.abs(share - expected.transmittance)[both].max(initial=0) <= (1e-4 if single else 1e-12)
+        bound = np.full(share.shape, 1e-4 if single else 1e-12)
+        if nudged is not None:
+            bound = np.fmax(bound, 4 * np.abs(nudged.transmittance - expected.transmittance))
+        assert (np.abs(share - expected.transmittance)[both] <= bound[both]).all()
     return int(both.sum())
 
 
@@ -167,7 +173,10 @@ def test_height_maps_equal_numpy(
     ):  # fmt: skip
         pixels = window(smooth, chamber, rng, 500).astype(dtype)
         expected = core.trace(pixels, drop, CAMERA, chamber, 3.0)
-        assert agree(trace(on(pixels, device), drop, CAMERA, chamber, 3.0), expected, slack) > 80
+        nudged = None
+        if dtype is np.float64:
+            nudged = core.trace(np.nextafter(pixels, np.inf), drop, CAMERA, chamber, 3.0)
+        assert agree(trace(on(pixels, device), drop, CAMERA, chamber, 3.0), expected, slack, nudged=nudged) > 80
 
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])

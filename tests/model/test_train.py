@@ -49,14 +49,14 @@ def test_each_update_touches_its_own_network_only(pairs):
     trainer, (batch, *_) = trainer_and_batches(pairs)
     parts, first = [(batch.rainy, batch.clear)], [trainer.generator(batch.rainy)]
     generator, discriminator = copied(trainer.generator), copied(trainer.discriminator)
-    _, good = trainer._discriminator_step(parts, first, 1e-3)
+    _, good = trainer._discriminator_step(parts, first, 1e-3, torch.tensor(True))
     assert good
     assert same(trainer.generator, generator)
     assert not same(trainer.discriminator, discriminator)
     assert all(p.grad is None for p in trainer.generator.parameters())
     discriminator = copied(trainer.discriminator)
     gradients = [p.grad.clone() for p in trainer.discriminator.parameters()]
-    _, good = trainer._generator_step(parts, first, 1e-3)
+    _, good = trainer._generator_step(parts, first, 1e-3, torch.tensor(True))
     assert good
     assert same(trainer.discriminator, discriminator)
     assert not same(trainer.generator, generator)
@@ -118,7 +118,10 @@ def test_values_that_are_not_finite_are_skipped_and_counted(pairs):
         assert same(trainer.generator, before)
         assert len(trainer.generator_optimizer.state) == moments
     huge = dataclasses.replace(good, rainy=torch.full_like(good.rainy, 3e38))
+    before = copied(trainer.generator), copied(trainer.discriminator)
     assert trainer.step(huge, 0.0).skipped == "gradients that are not finite"
+    assert same(trainer.generator, before[0])
+    assert same(trainer.discriminator, before[1])
     assert not trainer.step(good, 0.0).skipped
     assert (trainer.done, trainer.skipped) == (4, 3)
     assert all(bool(t.isfinite().all()) for t in trainer.generator.state_dict().values())
@@ -302,3 +305,14 @@ def test_two_processes_learn_what_one_learns(pairs, tmp_path):
         assert len(values) == 4, step
     assert json.loads((tmp_path / "two/report.json").read_text())["steps"] == 5
     assert two.card["processes"] == 2
+
+
+def test_a_run_on_each_device_goes_on_where_it_stopped(pairs, tmp_path, device):
+    """Named by its kind alone, as "auto" finds it."""
+    compute = {"device": device.type}
+    run, first = train(small(pairs, steps=2, compute=compute), tmp_path)
+    again, second = train(small(pairs, steps=4, compute=compute), tmp_path)
+    assert again.trainer.device.type == device.type
+    assert (again.begun_at, again.trainer.done) == (2, 4)
+    assert all(np.isfinite(value) for losses in first.losses + second.losses for value in losses.values())
+    assert not same(again.trainer.generator, copied(run.trainer.generator))
