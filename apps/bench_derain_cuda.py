@@ -44,12 +44,12 @@ def works(
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)
     tell = "From uint8 frames in the computer's memory to uint8 frames there" + f", on {where}."
     wide = _work(
-        f"cuda-paper-{width}", f"The paper's network on a GPU, {size}", papers, frames,
+        f"paper-{width}", f"The paper's network on a GPU, {size}", papers, frames,
         tell + " base_channels 64, 255 GMACs at 640 x 480, random weights; nothing is skipped.", device,
         HERTZ.get(height) if promised else None,
     )  # fmt: skip
     own = _work(
-        f"cuda-shipped-{width}", f"The package's network on a GPU, {size}", shipped, frames,
+        f"shipped-{width}", f"The package's network on a GPU, {size}", shipped, frames,
         tell + " Nothing is skipped, but in the last row: frames with a tenth under drops, the detector on the GPU.",
         device, None, fewer,
     )  # fmt: skip
