@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.special import chndtr
@@ -141,19 +141,7 @@ class ScatteredPopulation(Population):
         emptiness = -math.log1p(-self.cover)
         if self.clustering is None:
             return emptiness / area
-        return emptiness / self._effective_area(self.clustering) * self.clustering.size
-
-    def _effective_area(self, groups: Clustering) -> float:
-        """The integral above: square metres that a group covers on average where groups never overlap."""
-        a = 0.5 * self.diameter.quantile((np.arange(SIZES) + 0.5) / SIZES)[:, None]
-        reach = 8 * groups.radius + 0.5 * self.diameter.largest
-        r = (np.arange(RADIAL) + 0.5) / RADIAL * reach
-        p = chndtr((a / groups.radius) ** 2, 2, (r / groups.radius) ** 2).mean(0)
-        ring = 2 * math.pi * r * (reach / RADIAL)
-        # the few radii only weigh the saturation: the total of p, the mean area, is known exactly
-        exact = math.pi / 4 * self.diameter.moment(2)
-        p *= exact / float(p @ ring)
-        return float(-np.expm1(-groups.size * p) @ ring)
+        return emptiness / _effective_area(self.diameter, self.clustering) * self.clustering.size
 
     def _place(self, rng: np.random.Generator, pane: Pane) -> tuple[Array, Array, Array]:
         if self.clustering is None:
@@ -169,6 +157,20 @@ class ScatteredPopulation(Population):
             keep = _spread_out(x, y, radius, 1 + self.gap, where)
             x, y, radius = x[keep], y[keep], radius[keep]
         return x, y, radius
+
+
+@lru_cache(maxsize=64)  # the same for all covers, and asked for twice a frame
+def _effective_area(diameter: LogNormal, groups: Clustering) -> float:
+    """The integral of `density`: square metres that a group covers on average where groups never overlap."""
+    a = 0.5 * diameter.quantile((np.arange(SIZES) + 0.5) / SIZES)[:, None]
+    reach = 8 * groups.radius + 0.5 * diameter.largest
+    r = (np.arange(RADIAL) + 0.5) / RADIAL * reach
+    p = chndtr((a / groups.radius) ** 2, 2, (r / groups.radius) ** 2).mean(0)
+    ring = 2 * math.pi * r * (reach / RADIAL)
+    # the few radii only weigh the saturation: the total of p, the mean area, is known exactly
+    exact = math.pi / 4 * diameter.moment(2)
+    p *= exact / float(p @ ring)
+    return float(-np.expm1(-groups.size * p) @ ring)
 
 
 class _Parents:
