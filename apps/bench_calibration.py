@@ -66,12 +66,17 @@ def infinity_error(found: Rig, truth: Rig) -> float:
     Parallel panels do not turn rays, so far away the true directions are those of the bare cameras. One rotation of the
     whole rig is free: nothing that a calibration sees ties the rig to the world.
     """
-    ours, true = (np.concatenate([_directions(rig, role) for role in ROLES]) for rig in (found, truth))
+    ours, true = far_rays(found), far_rays(truth)
     known = np.isfinite(ours).all(-1)
     U, _, Vt = np.linalg.svd(true[known].T @ ours[known])  # Kabsch: the rotation from ours to the truth
     turned = ours[known] @ (U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt).T
     focal = float(truth.dry.intrinsics[0])
     return focal * float(np.sqrt(((turned - true[known]) ** 2).sum(-1).mean()))
+
+
+def far_rays(rig: Rig) -> Float:
+    """Unit rays, (N, 3), of a grid of pixels of the dry image, then of the wet one, in the frame of the dry camera."""
+    return np.concatenate([_directions(rig, role) for role in ROLES])
 
 
 def matching_error(found: Rig, truth: Rig) -> float:

@@ -1,17 +1,22 @@
 """Monte Carlo of calibrations through panels: many captures of one digital rig that differ by noise only.
 
 Each run draws the corners' noise and, where a description has standard deviations, what caliper, protractor and data
-sheet said. What came out is held against the truth, and its scatter against the sigma that each run predicted.
+sheet said. What came out is held against the truth, and its scatter against the sigma that each run predicted. Every
+second run has the errors of the one before with their signs turned: whatever is linear in them leaves the mean, so that
+a bias shows that would otherwise hide in the scatter.
 """
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
 
 import numpy as np
 
-from rainstereo import Chamber, Panel, Rig
-from rainstereo.apps.bench_calibration import infinity_error
+from rainstereo import Camera, Chamber, Panel, Rig
+from rainstereo.apps.bench_calibration import far_rays, infinity_error
 from rainstereo.apps.board_poses import board_poses
 from rainstereo.apps.digital_rig import RigOptions, digital_rig, exact_observations, noisy_observations, seen_by
 from rainstereo.calib import contributions, point_uncertainty, uncertainty
@@ -20,12 +25,15 @@ from rainstereo.calib.prior import Prior
 from rainstereo.calib.slab import across
 from rainstereo.calib.solve import Solution, solve
 from rainstereo.calib.sought import Sought
+from rainstereo.calib.state_covariance import Covariance
 from rainstereo.chamber import ChamberUncertainty
 from rainstereo.rig import ROLES
 from rainstereo.triangulation import triangulate
 from rainstereo.types import Array
 
-BOARD = Board.parse("chessboard:10x7:22mm")
+BOARD = Board.parse("chessboard:14x10:17mm")
+COARSE = Board.parse("chessboard:10x7:22mm")
+"""As large, with half as many corners."""
 NOISE_PX = 0.1
 MODEL = "LENSMODEL_OPENCV8"
 SD = ChamberUncertainty((2e-5, 2e-5), np.deg2rad(0.5), (0.002, 0.002))
@@ -35,7 +43,7 @@ MODES = ("known", "estimated", "exact", "ignored", "paired")
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """A rig, boards, and how they are calibrated.
+    """A rig, poses of a board, and how they are calibrated.
 
     mode: "exact" panels known exactly, "known" as described with SD, "estimated" improved by the corners, "ignored";
     "paired" with as many bare frames of the same poses. frames: poses.
@@ -46,25 +54,33 @@ class Setting:
     frames: int
     near: float | None = None
     far: float | None = None
-    wedge: float = 0.0
+    board: Board = BOARD
 
 
 @dataclass(frozen=True, eq=False)
 class Outcomes:
     """Of all runs, by quantity: error (found minus true, in the unit named) and the sigma predicted, (runs,) each.
 
-    infinity_px: (runs,), RMS over both images after one rotation of the rig. seconds: (runs,). wedges: found.
+    infinity_px: (runs,), RMS over both images after one rotation of the rig. bound_px: what each run predicts of it, by
+    the covariance of its solution, which for corners with normal noise is the bound of Cramer and Rao.
+    seconds: (runs,). wedges: found.
     """
 
     errors: dict[str, Array]
     sigmas: dict[str, Array]
     infinity_px: Array
+    bound_px: Array
     seconds: Array
     wedges: int
 
     def bias(self, name: str) -> float:
         """Mean error."""
         return float(self.errors[name].mean())
+
+    def bias_sigma(self, name: str) -> float:
+        """Standard deviation of `bias`, from the means of each run and its mirror image."""
+        means = self.errors[name][: len(self.errors[name]) // 2 * 2].reshape(-1, 2).mean(-1)
+        return float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else float("nan")
 
     def scatter(self, name: str) -> float:
         """RMS error."""
@@ -89,64 +105,119 @@ class Capture:
         if setting.mode not in MODES:
             raise ValueError(f"mode {setting.mode!r} was given; expected one of {', '.join(MODES)}")
         truth = digital_rig(RigOptions(tilt_deg=setting.tilt_deg), seed)
-        poses = board_poses(truth, BOARD, setting.frames, seed, near=setting.near, far=setting.far)
-        exact = exact_observations(truth, BOARD, poses)
+        board = setting.board
+        poses = board_poses(truth, board, setting.frames, seed, near=setting.near, far=setting.far)
+        exact = exact_observations(truth, board, poses)
         if setting.mode == "paired":
-            bare = exact_observations(truth, BOARD, poses, through=False)
+            bare = exact_observations(truth, board, poses, through=False)
             exact = (np.concatenate([bare[0], exact[0]]), np.concatenate([bare[1], exact[1]]))
         return cls(setting, truth, exact)
 
-    def calibrated(self, rng: np.random.Generator) -> Solution:
-        """One draw of the noise, calibrated."""
-        seen = noisy_observations(self.truth, BOARD, self.exact, NOISE_PX, rng)
-        return solve(seen, MODEL, self._sought(rng))
+    def calibrated(self, seed: int, run: int) -> Solution:
+        """One draw of all errors, calibrated."""
+        rng, sign = np.random.default_rng([seed, run // 2, 0x51AB]), 1.0 - 2.0 * (run % 2)
+        seen = noisy_observations(self.truth, self.setting.board, self.exact, NOISE_PX, rng)
+        if sign < 0:
+            dry, wet = (2 * exact - noisy for exact, noisy in zip(self.exact, (seen.dry, seen.wet), strict=True))
+            seen = replace(seen, dry=dry, wet=wet)
+        return solve(seen, MODEL, self._sought(rng, sign))
 
-    def _sought(self, rng: np.random.Generator) -> Chamber | Sought | None:
+    def _sought(self, rng: np.random.Generator, sign: float) -> Chamber | Sought | None:
         chamber, mode, count = self.truth.chamber, self.setting.mode, self.setting.frames
         if chamber is None or mode == "ignored":
             return None
         if mode == "exact":
-            return chamber
+            return replace(chamber, uncertainty=ChamberUncertainty((0.0, 0.0), 0.0, (0.0, 0.0)))
         if mode == "paired":
-            rough = replace(described(chamber, rng, 4.0), panels=tuple(Panel(0.0038, p.index) for p in chamber.panels))
+            thin = tuple(Panel(panel.thickness - 2e-4, panel.index) for panel in chamber.panels)
+            rough = replace(described(chamber, rng, 4.0 * sign), panels=thin)
             through, ties = np.arange(2 * count) >= count, np.arange(2 * count) % count
             return Sought(rough, ("tilt", "thickness"), None, through, ties, wedge=True)
-        known = described(chamber, rng)
+        known = described(chamber, rng, sign)
         return known if mode == "known" else Sought(known, ("tilt", "thickness", "index"), Prior(known))
 
 
-def outcomes(capture: Capture, runs: int, seed: int) -> Outcomes:
-    """Calibrate `runs` draws of a capture."""
-    rows: list[tuple[dict[str, tuple[float, float]], float, float, int]] = []
-    for run in range(runs):
-        solution = capture.calibrated(np.random.default_rng([seed, run, 0x51AB]))
-        told, far = quantities(solution, capture.truth), infinity_error(solution.rig, capture.truth)
-        rows.append((told, far, solution.solve_seconds, _wedged(solution)))
-    names = list(rows[0][0])
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run: error and sigma by quantity, error at infinity and its bound, seconds, whether a wedge was found."""
+
+    told: dict[str, tuple[float, float]]
+    infinity_px: float
+    bound_px: float
+    seconds: float
+    wedged: bool
+
+
+def outcomes(capture: Capture, runs: int, seed: int, workers: int = 1) -> Outcomes:
+    """Calibrate `runs` draws of a capture, in so many processes; their number changes nothing."""
+    if workers == 1:
+        found = [one(capture, seed, run) for run in range(runs)]
+    else:
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+            found = list(pool.map(partial(one, capture, seed), range(runs), chunksize=4))
+    values = {name: np.array([run.told[name] for run in found]) for name in found[0].told}
     return Outcomes(
-        {name: np.array([row[0][name][0] for row in rows]) for name in names},
-        {name: np.array([row[0][name][1] for row in rows]) for name in names},
-        np.array([row[1] for row in rows]),
-        np.array([row[2] for row in rows]),
-        sum(row[3] for row in rows),
+        {name: value[:, 0] for name, value in values.items()},
+        {name: value[:, 1] for name, value in values.items()},
+        np.array([run.infinity_px for run in found]),
+        np.array([run.bound_px for run in found]),
+        np.array([run.seconds for run in found]),
+        sum(run.wedged for run in found),
     )
 
 
+def one(capture: Capture, seed: int, run: int) -> Run:
+    """One run of a study."""
+    solution = capture.calibrated(seed, run)
+    spread = contributions.contributions(solution)
+    return Run(
+        quantities(solution, capture.truth, spread),
+        infinity_error(solution.rig, capture.truth),
+        infinity_bound(solution, spread.total),
+        solution.solve_seconds,
+        solution.estimate is not None and "wedge" in solution.estimate.slab.free,
+    )
+
+
+def infinity_bound(solution: Solution, cov: Covariance) -> float:
+    """What `bench_calibration.infinity_error` is in the root of the mean square, by a solution's covariance, pixels.
+
+    Directions of both images move by J db; the rotation of the whole rig that fits best, whose derivatives are the
+    columns of T, is taken off them.
+    """
+    rig, layout = solution.rig, cov.layout
+    state = np.concatenate([rig.dry.intrinsics, rig.wet.intrinsics, rig.wet.rt_cam_ref])
+    which = np.concatenate([np.arange(layout.size)[span] for span in (*layout.intrinsics, layout.extrinsics)])
+    k = len(rig.dry.intrinsics)
+
+    def directions(at: Array) -> Array:
+        dry = Camera(rig.dry.model, at[:k], *rig.dry.size)
+        wet = Camera(rig.wet.model, at[k : 2 * k], *rig.wet.size, at[2 * k :])
+        return far_rays(Rig(dry, wet, None)).ravel()
+
+    here = directions(state)
+    sd = np.sqrt(np.diag(cov.matrix))[which]
+    J = np.stack([(directions(state + step) - here) / sd[i] for i, step in enumerate(np.diag(sd))], -1)
+    T = np.stack([np.cross(axis, here.reshape(-1, 3)).ravel() for axis in np.eye(3)], -1)
+    J = J - T @ np.linalg.lstsq(T, J, rcond=None)[0]
+    square = float(np.sum((J @ cov.matrix[np.ix_(which, which)]) * J)) / (len(here) / 3)
+    return float(rig.dry.intrinsics[0]) * float(np.sqrt(square))
+
+
 def described(chamber: Chamber, rng: np.random.Generator, times: float = 1.0) -> Chamber:
-    """The chamber as somebody measured it: off by SD, `times` as much in tilt; the index of all panels alike."""
+    """The chamber as somebody measured it: off by `times` SD; the index of all panels alike."""
     normal = np.asarray(chamber.normal) + across(chamber.normal) @ (times * SD.tilt * rng.standard_normal(2))
-    index = float(rng.normal(0, SD.index[0])) if times == 1.0 else 0.0
+    index = times * float(rng.normal(0, SD.index[0]))
     panels = tuple(
-        Panel(panel.thickness + float(rng.normal(0, sd)), panel.index + index)
+        Panel(panel.thickness + times * float(rng.normal(0, sd)), panel.index + index)
         for panel, sd in zip(chamber.panels, SD.thickness, strict=True)
     )
     x, y, z = normal.tolist()
     return replace(chamber, normal=(x, y, z), panels=panels, uncertainty=SD)
 
 
-def quantities(solution: Solution, truth: Rig) -> dict[str, tuple[float, float]]:
+def quantities(solution: Solution, truth: Rig, spread: contributions.Contributions) -> dict[str, tuple[float, float]]:
     """Error and predicted sigma of what a calibration is asked for: mm, degrees, pixels."""
-    spread = contributions.contributions(solution)
     cov, rig = spread.total, solution.rig
     told: dict[str, tuple[float, float]] = {}
     sd = np.sqrt(np.diag(cov.matrix))
@@ -178,7 +249,3 @@ def _depth(solution: Solution, truth: Rig, spread: contributions.Contributions) 
     )
     depth = float(np.asarray(found.points)[0, 2])
     return 1e3 * (depth - DEPTH_M), 1e3 * float(np.sqrt(points.from_calibration[0, 2, 2]))
-
-
-def _wedged(solution: Solution) -> int:
-    return int(solution.estimate is not None and "wedge" in solution.estimate.slab.free)
