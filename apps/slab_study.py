@@ -1,9 +1,9 @@
 """Monte Carlo of calibrations through panels: many captures of one digital rig that differ by noise only.
 
 Each run draws the corners' noise and, where a description has standard deviations, what caliper, protractor and data
-sheet said. What came out is held against the truth, and its scatter against the sigma that each run predicted. Every
-second run has the errors of the one before with their signs turned: whatever is linear in them leaves the mean, so that
-a bias shows that would otherwise hide in the scatter.
+sheet said. What came out is held against the truth, and its scatter against the sigma that each run predicted. A few
+runs are repeated with all errors' signs turned: what is linear in them leaves the mean of the two, and a bias shows
+that would otherwise hide in the scatter of hundreds of runs.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from multiprocessing import get_context
 import numpy as np
 
 from rainstereo import Camera, Chamber, Panel, Rig
-from rainstereo.apps.bench_calibration import far_rays, infinity_error
 from rainstereo.apps.board_poses import board_poses
 from rainstereo.apps.digital_rig import RigOptions, digital_rig, exact_observations, noisy_observations, seen_by
+from rainstereo.apps.rig_error import far_rays, infinity_error
 from rainstereo.calib import contributions, point_uncertainty, uncertainty
 from rainstereo.calib.board import Board
+from rainstereo.calib.observations import Observations
 from rainstereo.calib.prior import Prior
 from rainstereo.calib.slab import across
 from rainstereo.calib.solve import Solution, solve
@@ -38,6 +39,7 @@ NOISE_PX = 0.1
 MODEL = "LENSMODEL_OPENCV8"
 SD = ChamberUncertainty((2e-5, 2e-5), np.deg2rad(0.5), (0.002, 0.002))
 DEPTH_M = 2.0
+MIRRORED = 10
 MODES = ("known", "estimated", "exact", "ignored", "paired")
 
 
@@ -61,26 +63,31 @@ class Setting:
 class Outcomes:
     """Of all runs, by quantity: error (found minus true, in the unit named) and the sigma predicted, (runs,) each.
 
-    infinity_px: (runs,), RMS over both images after one rotation of the rig. bound_px: what each run predicts of it, by
-    the covariance of its solution, which for corners with normal noise is the bound of Cramer and Rao.
-    seconds: (runs,). wedges: found.
+    mirrored: errors of the first runs again, with the signs of all that was drawn turned, (pairs,).
+    infinity_px: (runs,), RMS over both images after one rotation of the rig. bound_px: what the first run predicts of
+    it by the covariance of its solution, which for corners with normal noise is the bound of Cramer and Rao.
+    wedges: in how many runs one was found.
     """
 
     errors: dict[str, Array]
     sigmas: dict[str, Array]
+    mirrored: dict[str, Array]
     infinity_px: Array
-    bound_px: Array
-    seconds: Array
+    bound_px: float
     wedges: int
 
     def bias(self, name: str) -> float:
-        """Mean error."""
-        return float(self.errors[name].mean())
+        """Mean error of the runs that have a mirror image, and of those."""
+        return float(self._middles(name).mean())
 
     def bias_sigma(self, name: str) -> float:
-        """Standard deviation of `bias`, from the means of each run and its mirror image."""
-        means = self.errors[name][: len(self.errors[name]) // 2 * 2].reshape(-1, 2).mean(-1)
-        return float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else float("nan")
+        """Standard deviation of `bias`."""
+        middles = self._middles(name)
+        return float(middles.std(ddof=1) / np.sqrt(len(middles))) if len(middles) > 1 else float("nan")
+
+    def _middles(self, name: str) -> Array:
+        turned = self.mirrored[name]
+        return np.asarray((self.errors[name][: len(turned)] + turned) / 2)
 
     def scatter(self, name: str) -> float:
         """RMS error."""
@@ -113,16 +120,22 @@ class Capture:
             exact = (np.concatenate([bare[0], exact[0]]), np.concatenate([bare[1], exact[1]]))
         return cls(setting, truth, exact)
 
-    def calibrated(self, seed: int, run: int) -> Solution:
-        """One draw of all errors, calibrated."""
-        rng, sign = np.random.default_rng([seed, run // 2, 0x51AB]), 1.0 - 2.0 * (run % 2)
-        seen = noisy_observations(self.truth, self.setting.board, self.exact, NOISE_PX, rng)
-        if sign < 0:
-            dry, wet = (2 * exact - noisy for exact, noisy in zip(self.exact, (seen.dry, seen.wet), strict=True))
-            seen = replace(seen, dry=dry, wet=wet)
-        return solve(seen, MODEL, self._sought(rng, sign))
+    def calibrated(self, seed: int, run: int, sign: float = 1.0) -> Solution:
+        """One draw of all errors, calibrated. sign: -1 turns them round."""
+        return solve(self.drawn(seed, run, sign), MODEL, self.sought(seed, run, sign))
 
-    def _sought(self, rng: np.random.Generator, sign: float) -> Chamber | Sought | None:
+    def drawn(self, seed: int, run: int, sign: float = 1.0) -> Observations:
+        """The corners of a run."""
+        rng = np.random.default_rng([seed, run, 0x51AB])
+        seen = noisy_observations(self.truth, self.setting.board, self.exact, NOISE_PX, rng)
+        if sign > 0:
+            return seen
+        dry, wet = (2 * exact - noisy for exact, noisy in zip(self.exact, (seen.dry, seen.wet), strict=True))
+        return replace(seen, dry=dry, wet=wet)
+
+    def sought(self, seed: int, run: int, sign: float = 1.0) -> Chamber | Sought | None:
+        """What a run is told about the panels, and is to find out."""
+        rng = np.random.default_rng([seed, run, 0x51AC])
         chamber, mode, count = self.truth.chamber, self.setting.mode, self.setting.frames
         if chamber is None or mode == "ignored":
             return None
@@ -139,48 +152,49 @@ class Capture:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run: error and sigma by quantity, error at infinity and its bound, seconds, whether a wedge was found."""
+    """One run: error and sigma by quantity, error at infinity, its bound (the first run's only), whether a wedge
+    was found."""
 
     told: dict[str, tuple[float, float]]
     infinity_px: float
     bound_px: float
-    seconds: float
     wedged: bool
 
 
 def outcomes(capture: Capture, runs: int, seed: int, workers: int = 1) -> Outcomes:
     """Calibrate `runs` draws of a capture, in so many processes; their number changes nothing."""
+    jobs = [(run, 1.0) for run in range(runs)] + [(run, -1.0) for run in range(min(runs, MIRRORED))]
     if workers == 1:
-        found = [one(capture, seed, run) for run in range(runs)]
+        found = [one(capture, seed, *job) for job in jobs]
     else:
         with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-            found = list(pool.map(partial(one, capture, seed), range(runs), chunksize=4))
-    values = {name: np.array([run.told[name] for run in found]) for name in found[0].told}
+            found = list(pool.map(partial(one, capture, seed), *zip(*jobs, strict=True), chunksize=4))
+    names = list(found[0].told)
+    errors = {name: np.array([run.told[name][0] for run in found]) for name in names}
     return Outcomes(
-        {name: value[:, 0] for name, value in values.items()},
-        {name: value[:, 1] for name, value in values.items()},
-        np.array([run.infinity_px for run in found]),
-        np.array([run.bound_px for run in found]),
-        np.array([run.seconds for run in found]),
+        {name: error[:runs] for name, error in errors.items()},
+        {name: np.array([run.told[name][1] for run in found[:runs]]) for name in names},
+        {name: error[runs:] for name, error in errors.items()},
+        np.array([run.infinity_px for run in found[:runs]]),
+        found[0].bound_px,
         sum(run.wedged for run in found),
     )
 
 
-def one(capture: Capture, seed: int, run: int) -> Run:
+def one(capture: Capture, seed: int, run: int, sign: float = 1.0) -> Run:
     """One run of a study."""
-    solution = capture.calibrated(seed, run)
+    solution = capture.calibrated(seed, run, sign)
     spread = contributions.contributions(solution)
     return Run(
         quantities(solution, capture.truth, spread),
         infinity_error(solution.rig, capture.truth),
-        infinity_bound(solution, spread.total),
-        solution.solve_seconds,
+        infinity_bound(solution, spread.total) if run == 0 and sign > 0 else float("nan"),
         solution.estimate is not None and "wedge" in solution.estimate.slab.free,
     )
 
 
 def infinity_bound(solution: Solution, cov: Covariance) -> float:
-    """What `bench_calibration.infinity_error` is in the root of the mean square, by a solution's covariance, pixels.
+    """What `rig_error.infinity_error` is in the root of the mean square, by a solution's covariance, pixels.
 
     Directions of both images move by J db; the rotation of the whole rig that fits best, whose derivatives are the
     columns of T, is taken off them.
