@@ -85,7 +85,7 @@ def _variant(name: str, setting: Setting, runs: int, seed: int) -> Variant:
 
     @cache
     def study() -> Outcomes:
-        return outcomes(capture, runs, seed, 1 if runs <= 2 else min(len(os.sched_getaffinity(0)), MOST_WORKERS))
+        return outcomes(capture, runs, seed, 1 if runs <= 2 else workers())
 
     def run() -> Solution:
         return capture.calibrated(seed, 0)
@@ -96,20 +96,29 @@ def _variant(name: str, setting: Setting, runs: int, seed: int) -> Variant:
 
     def also(first: Solution) -> Mapping[str, float]:
         del first
-        found = study()
-        lens = [name for name in found.errors if name.endswith(", px")]
-        told = {
-            "bound, px": found.bound_px,
-            "ratio, lens": float(np.sqrt(np.mean([found.ratio(name) ** 2 for name in lens]))),
-            "depth bias, mm": found.bias("depth at 2 m, mm"),
-            "its sigma, mm": found.bias_sigma("depth at 2 m, mm"),
-            "depth RMS, mm": found.scatter("depth at 2 m, mm"),
-            "ratio, depth": found.ratio("depth at 2 m, mm"),
-        }
-        for what in ("pitch, deg", "yaw, deg", "thickness a panel, mm"):
-            there = what in found.errors
-            told[f"{what}: RMS"] = found.scatter(what) if there else float("nan")
-            told[f"{what}: ratio"] = found.ratio(what) if there else float("nan")
-        return told
+        return told(study())
 
     return Variant(name, run, error, name != "ignored", WORDS[name], also=also)
+
+
+def told(found: Outcomes) -> dict[str, float]:
+    """The figures of a study by name with unit."""
+    lens, depth = [name for name in found.errors if name.endswith(", px")], "depth at 2 m, mm"
+    words = {
+        "bound, px": found.bound_px,
+        "ratio, lens": float(np.sqrt(np.mean([found.ratio(name) ** 2 for name in lens]))),
+        "depth bias, mm": found.bias(depth),
+        "its sigma, mm": found.bias_sigma(depth),
+        "depth RMS, mm": found.scatter(depth),
+        "ratio, depth": found.ratio(depth),
+    }
+    for what in ("pitch, deg", "yaw, deg", "thickness a panel, mm"):
+        there = what in found.errors
+        words[f"{what}: RMS"] = found.scatter(what) if there else float("nan")
+        words[f"{what}: ratio"] = found.ratio(what) if there else float("nan")
+    return words
+
+
+def workers() -> int:
+    """How many processes share the runs."""
+    return min(len(os.sched_getaffinity(0)), MOST_WORKERS)

@@ -8,6 +8,7 @@ that would otherwise hide in the scatter of hundreds of runs.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,6 +41,8 @@ MODEL = "LENSMODEL_OPENCV8"
 SD = ChamberUncertainty((2e-5, 2e-5), np.deg2rad(0.5), (0.002, 0.002))
 DEPTH_M = 2.0
 MIRRORED = 10
+LITTLE = 1e-3
+"""Of a standard deviation: a step over which directions change linearly."""
 MODES = ("known", "estimated", "exact", "ignored", "paired")
 
 
@@ -77,8 +80,9 @@ class Outcomes:
     wedges: int
 
     def bias(self, name: str) -> float:
-        """Mean error of the runs that have a mirror image, and of those."""
-        return float(self._middles(name).mean())
+        """Mean error of the runs that have a mirror image, and of those; NaN if there are none."""
+        middles = self._middles(name)
+        return float(middles.mean()) if len(middles) else float("nan")
 
     def bias_sigma(self, name: str) -> float:
         """Standard deviation of `bias`."""
@@ -100,10 +104,13 @@ class Outcomes:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A setting with its rig and where the corners are without noise: dry and wet, (N, rows, columns, 2)."""
+    """A setting with its rig, the board's poses, (frames, 6), and where the corners are without noise: dry and wet,
+    (N, rows, columns, 2), of paired captures those without the chamber first.
+    """  # fmt: skip
 
     setting: Setting
     truth: Rig
+    poses: Array
     exact: tuple[Array, Array]
 
     @classmethod
@@ -118,7 +125,7 @@ class Capture:
         if setting.mode == "paired":
             bare = exact_observations(truth, board, poses, through=False)
             exact = (np.concatenate([bare[0], exact[0]]), np.concatenate([bare[1], exact[1]]))
-        return cls(setting, truth, exact)
+        return cls(setting, truth, poses, exact)
 
     def calibrated(self, seed: int, run: int, sign: float = 1.0) -> Solution:
         """One draw of all errors, calibrated. sign: -1 turns them round."""
@@ -169,26 +176,34 @@ def outcomes(capture: Capture, runs: int, seed: int, workers: int = 1) -> Outcom
     else:
         with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
             found = list(pool.map(partial(one, capture, seed), *zip(*jobs, strict=True), chunksize=4))
-    names = list(found[0].told)
-    errors = {name: np.array([run.told[name][0] for run in found]) for name in names}
+    return gathered(found[:runs], found[runs:])
+
+
+def gathered(runs: Sequence[Run], mirrored: Sequence[Run] = ()) -> Outcomes:
+    """What many runs, and the first of them with all errors turned, have in common."""
+    names = list(runs[0].told)
     return Outcomes(
-        {name: error[:runs] for name, error in errors.items()},
-        {name: np.array([run.told[name][1] for run in found[:runs]]) for name in names},
-        {name: error[runs:] for name, error in errors.items()},
-        np.array([run.infinity_px for run in found[:runs]]),
-        found[0].bound_px,
-        sum(run.wedged for run in found),
+        {name: np.array([run.told[name][0] for run in runs]) for name in names},
+        {name: np.array([run.told[name][1] for run in runs]) for name in names},
+        {name: np.array([run.told[name][0] for run in mirrored]) for name in names},
+        np.array([run.infinity_px for run in runs]),
+        runs[0].bound_px,
+        sum(run.wedged for run in runs),
     )
 
 
 def one(capture: Capture, seed: int, run: int, sign: float = 1.0) -> Run:
     """One run of a study."""
-    solution = capture.calibrated(seed, run, sign)
+    return judged(capture.calibrated(seed, run, sign), capture.truth, bound=run == 0 and sign > 0)
+
+
+def judged(solution: Solution, truth: Rig, *, bound: bool) -> Run:
+    """A calibration held against the truth; with the bound of its error at infinity, which takes a while, or NaN."""
     spread = contributions.contributions(solution)
     return Run(
-        quantities(solution, capture.truth, spread),
-        infinity_error(solution.rig, capture.truth),
-        infinity_bound(solution, spread.total) if run == 0 and sign > 0 else float("nan"),
+        quantities(solution, truth, spread),
+        infinity_error(solution.rig, truth),
+        infinity_bound(solution, spread.total) if bound else float("nan"),
         solution.estimate is not None and "wedge" in solution.estimate.slab.free,
     )
 
@@ -211,10 +226,12 @@ def infinity_bound(solution: Solution, cov: Covariance) -> float:
 
     here = directions(state)
     sd = np.sqrt(np.diag(cov.matrix))[which]
-    J = np.stack([(directions(state + step) - here) / sd[i] for i, step in enumerate(np.diag(sd))], -1)
+    J = np.stack([(directions(state + step) - here) / step[i] for i, step in enumerate(np.diag(LITTLE * sd))], -1)
     T = np.stack([np.cross(axis, here.reshape(-1, 3)).ravel() for axis in np.eye(3)], -1)
+    answered = np.isfinite(J).all(-1)
+    J, T = J[answered], T[answered]
     J = J - T @ np.linalg.lstsq(T, J, rcond=None)[0]
-    square = float(np.sum((J @ cov.matrix[np.ix_(which, which)]) * J)) / (len(here) / 3)
+    square = float(np.sum((J @ cov.matrix[np.ix_(which, which)]) * J)) / (len(J) / 3)
     return float(rig.dry.intrinsics[0]) * float(np.sqrt(square))
 
 
