@@ -66,7 +66,7 @@ def calibrated(setting: Setting, seed: int, photo: Photographed) -> Solution:
 def _judged(capture: Capture, corners: tuple[Array, Array], seed: int) -> Photographed:
     dry, wet = corners
     names = tuple(f"{i:03d}" for i in range(len(dry)))
-    sizes = {role: capture.truth.camera(role).size for role in ROLES}
+    sizes: dict[str, tuple[int, int]] = {role: capture.truth.camera(role).size for role in ROLES}
     seen = Observations(capture.setting.board, names, dry, wet, sizes)
     off = np.stack(corners) - np.stack(capture.exact)
     solution = solve(seen, MODEL, capture.sought(seed, 0))
