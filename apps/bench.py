@@ -26,6 +26,7 @@ STAGES: dict[str, str] = {
     "cavity": "rainstereo.apps.bench_cavity",
     "guidance": "rainstereo.apps.bench_guidance",
     "slab": "rainstereo.apps.bench_slab",
+    "slab-images": "rainstereo.apps.bench_slab_images",
     "drops": "rainstereo.apps.bench_drops",
     "rain": "rainstereo.apps.bench_rain",
     "align": "rainstereo.apps.bench_align",

@@ -9,11 +9,12 @@ from functools import cache
 import numpy as np
 
 from rainstereo import Rig
-from rainstereo.apps.bench_calibration import BOARD, MODEL, NOISE_PX, infinity_error
+from rainstereo.apps.bench_calibration import BOARD, MODEL, NOISE_PX
 from rainstereo.apps.bench_harness import Stage, Target, Variant, Work
 from rainstereo.apps.board_poses import board_poses
 from rainstereo.apps.digital_rig import digital_rig, exact_observations
 from rainstereo.apps.guided_capture import Captured, anywhere, capture, unsteady
+from rainstereo.apps.rig_error import infinity_error
 from rainstereo.calib import guidance
 from rainstereo.calib.guidance import Proposal
 from rainstereo.calib.incremental import Incremental, View

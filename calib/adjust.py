@@ -204,9 +204,11 @@ def unflip(problem: Problem, points: Array) -> int:
         found = closed_form(problem, camera, points)
         for rank in range(2):
             trial = problem.copy()
-            for frame, candidates in found.items():
-                if len(candidates) > rank:
-                    trial.rt_ref_board[frame] = pose.compose(pose.invert(rt_cam_ref), candidates[rank].rt_cam_board)
+            placed = {frame: c[rank].rt_cam_board for frame, c in found.items() if len(c) > rank}
+            if placed:
+                trial.rt_ref_board[list(placed)] = pose.compose(
+                    pose.invert(rt_cam_ref), np.array(list(placed.values()))
+                )
             rms = frame_rms(trial)
             better = rms < 0.9 * best
             problem.rt_ref_board[better] = trial.rt_ref_board[better]
@@ -217,11 +219,11 @@ def unflip(problem: Problem, points: Array) -> int:
 def closed_form(problem: Problem, camera: int, points: Array) -> dict[int, list[seeding.Candidate]]:
     """For each frame that a camera saw the poses, one or two, that its inliers allow under the present lens."""
     focal = problem.intrinsics[camera, :2]
-    found = {}
-    for row in np.flatnonzero(problem.indices[:, 1] == camera):
-        view = problem.observations[row]
-        seen = view[..., 2] > 0
-        rays = versions.unproject(view[seen, :2], problem.lensmodel, problem.intrinsics[camera])
+    found, rows = {}, np.flatnonzero(problem.indices[:, 1] == camera)
+    everywhere = versions.unproject(problem.observations[rows][..., :2], problem.lensmodel, problem.intrinsics[camera])
+    for row, view_rays in zip(rows, everywhere, strict=True):
+        seen = problem.observations[row][..., 2] > 0
+        rays = view_rays[seen]
         if seen.sum() >= seeding.MIN_CORNERS and (rays[:, 2] > 0).all():
             xy = rays[:, :2] / rays[:, 2:]
             found[int(problem.indices[row, 0])] = seeding.poses_from_rays(points[seen], xy, focal)

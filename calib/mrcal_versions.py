@@ -395,26 +395,28 @@ def unproject(pixels: Array, lensmodel: str, intrinsics: Array) -> Array:
     return np.asarray(load().unproject(np.ascontiguousarray(pixels), lensmodel, intrinsics, normalize=True))
 
 
-def carried(problem: Problem, camera: int) -> dict[str, Any]:
-    """What mrcal's own tools want to find in this camera's model file: the whole problem, compressed.
+def carried(problem: Problem) -> list[dict[str, Any]]:
+    """What mrcal's own tools want to find in each camera's model file: the whole problem, compressed.
 
     A board with unequal steps becomes a finer regular one, mostly unseen; if that is too fine, nothing is carried.
 
     Written in the names from before 2.5, which every release reads. Plain arrays only, no pickle.
     """
+    cameras = range(len(problem.intrinsics))
     if problem.lattice is not None:
         from rainstereo.calib import unequal_steps
 
         regular = unequal_steps.as_regular(problem)
         if regular is None:
-            return {}
+            return [{} for _ in cameras]
         problem = regular
     stream = io.BytesIO()
     inputs = {**problem.arguments(legacy=True), "do_apply_outlier_rejection": False}
     # mrcal has no None in these files; it reads an empty string as None
     inputs = {name: "" if value is None else value for name, value in inputs.items()}
     np.savez_compressed(stream, **inputs)
-    return {"icam_intrinsics": camera, "optimization_inputs": base64.b85encode(stream.getvalue())}
+    packed = base64.b85encode(stream.getvalue())
+    return [{"icam_intrinsics": camera, "optimization_inputs": packed} for camera in cameras]
 
 
 def _tail(text: str, length: int = 300) -> str:

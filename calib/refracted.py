@@ -19,7 +19,7 @@ from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib import slab as slabs
 from rainstereo.calib.mrcal_versions import Layout, Problem, SolveError
 from rainstereo.calib.prior import Prior
-from rainstereo.calib.rotation import rotated_by
+from rainstereo.calib.rotation import by_rotation, rotated_by
 from rainstereo.calib.slab import Slab
 from rainstereo.chamber import Chamber
 from rainstereo.refraction import Status
@@ -161,8 +161,10 @@ def normal_equations(problem: Problem, observed: Array, panels: Chamber | Panels
         place, J, off, columns = _rows(problem, observed, panels, camera, layout)
         views = len(place.frames)
         weight = np.maximum(problem.observations[place.rows][..., 2], 0).reshape(views, -1, 1)
-        J = np.where(weight[..., None] > 0, J * weight[..., None] * scale[columns][:, None, None], 0)
-        off = np.where(weight > 0, off * weight, 0)
+        J *= weight[..., None] * scale[columns][:, None, None]
+        off *= weight
+        out = ~(weight[..., 0] > 0)
+        J[out], off[out] = 0, 0
         J, off = J.reshape(views, -1, J.shape[-1]), off.reshape(views, -1)
         grams, slopes = np.swapaxes(J, 1, 2) @ J, np.einsum("vns,vn->vs", J, off)
         for gram, slope, where in zip(grams, slopes, columns, strict=True):
@@ -188,27 +190,28 @@ def _rows(
     R, rt, frames, views = place.R, place.rt, place.frames, len(place.frames)
     apparent, moved, by_slab, by_centre = _moved(panels, place)
     count = apparent.shape[1]
-    seen, by_point, by_lens = versions.project_gradients(apparent @ R.T, problem.lensmodel, problem.intrinsics[camera])
+    in_camera = apparent @ R.T
+    seen, by_point, by_lens = versions.project_gradients(in_camera, problem.lensmodel, problem.intrinsics[camera])
     by_apparent = by_point @ R
     by_reference = by_apparent @ moved
     parts: list[Array] = [by_lens[..., layout.intrinsics_columns]]
     columns: list[Array] = [np.tile(_range(layout.intrinsics[camera]), (views, 1))]
     if camera and layout.extrinsics.stop:
-        turned = rotated_by(rt[:3], apparent.reshape(-1, 3)).reshape(views, count, 3, 3)
         receding = by_reference if by_centre is None else by_reference - by_apparent @ by_centre
-        parts += [by_point @ turned - receding @ rotated_by(-rt[:3], rt[3:]), receding @ R.T]
+        turned = by_rotation(by_point, in_camera, rt[:3])
+        parts += [turned - receding @ rotated_by(-rt[:3], rt[3:]), receding @ R.T]
         start = layout.extrinsics.start + 6 * (camera - 1)
         columns.append(np.tile(np.arange(start, start + 6), (views, 1)))
     board = _board(problem, problem.warp).reshape(-1, 3)
+    rotations = pose.rotation_matrix(problem.rt_ref_board[frames, :3])
     if layout.frames.stop:
-        turned = np.stack([rotated_by(r, board) for r in problem.rt_ref_board[frames, :3]])
-        parts += [by_reference @ turned, by_reference]
+        rotated = board @ np.swapaxes(rotations, 1, 2)
+        parts += [by_rotation(by_reference, rotated, problem.rt_ref_board[frames, None, :3]), by_reference]
         owners = frames if panels.ties is None else panels.ties[frames]
         columns.append(layout.frames.start + 6 * owners[:, None] + np.arange(6))
     if layout.warp.stop:
         shapes = [_board(problem, unit)[..., 2].ravel() for unit in np.eye(2)]
-        normals = pose.rotation_matrix(problem.rt_ref_board[frames, :3])[..., 2]
-        lifted = np.einsum("vnij,vj->vni", by_reference, normals)
+        lifted = (by_reference @ rotations[:, None, :, 2:])[..., 0]
         parts.append(lifted[..., None] * np.stack(shapes, -1)[None, :, None])
         columns.append(np.tile(_range(layout.warp), (views, 1)))
     if layout.slab.stop:

@@ -97,8 +97,8 @@ def poses_from_rays(points: Array, xy: Array, focal: Array) -> list[Candidate]:
         found = _ippe(points, xy, per_tangent)
         if not found:
             return []
-        off = found[0][1]
-        kept = off <= STANDS_OUT * np.median(off)
+        square = found[0][1]
+        kept = square <= STANDS_OUT**2 * np.median(square)
         if kept.all() or kept.sum() < MIN_CORNERS:
             break
         points, xy, per_tangent = points[kept], xy[kept], per_tangent[kept]
@@ -106,7 +106,7 @@ def poses_from_rays(points: Array, xy: Array, focal: Array) -> list[Candidate]:
 
 
 def _ippe(points: Array, xy: Array, per_tangent: Array) -> list[tuple[Candidate, Array]]:
-    """Poses, best first, and by how many pixels each corner is off, (N,)."""
+    """Poses, best first, and by how many squared pixels each corner is off, (N,)."""
     try:
         _, rotations, translations, _ = cv2.solvePnPGeneric(
             points[:, None], xy[:, None], np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
@@ -118,8 +118,9 @@ def _ippe(points: Array, xy: Array, per_tangent: Array) -> list[tuple[Candidate,
         rt = np.concatenate([r.ravel(), t.ravel()]).astype(np.float64)
         placed = points @ cv2.Rodrigues(rt[:3])[0].T + rt[3:]  # thousands of these: scipy's checks would take most time
         if np.isfinite(rt).all() and (placed[:, 2] > 0).all():
-            off = np.linalg.norm((placed[:, :2] / placed[:, 2:] - xy) * per_tangent, axis=-1)
-            found.append((Candidate(rt, float(np.sqrt(np.mean(off**2) / 2))), off))
+            off = (placed[:, :2] / placed[:, 2:] - xy) * per_tangent
+            square = np.einsum("ij,ij->i", off, off)
+            found.append((Candidate(rt, float(np.sqrt(square.sum() / (2 * len(square))))), square))
     return sorted(found, key=lambda pair: pair[0].error)
 
 
@@ -182,10 +183,12 @@ def _joined(
                 placed[frame] = candidates[0].rt_cam_board
         return Seed(lens, focals, None, placed, flipped, np.zeros(frames))
     if reversible:
-        turn = _half_turn(points)
+        half_turn, every = _half_turn(points), [c.rt_cam_board for candidates in found[1] for c in candidates]
+        turned = pose.compose(np.array(every).reshape(-1, 6), half_turn)
+        ends = np.cumsum([len(candidates) for candidates in found[1]])[:-1]
         found[1] = [
-            candidates + [Candidate(pose.compose(c.rt_cam_board, turn), c.error, True) for c in candidates]
-            for candidates in found[1]
+            candidates + [Candidate(rt, c.error, True) for c, rt in zip(candidates, rts, strict=True)]
+            for candidates, rts in zip(found[1], np.split(turned, ends), strict=True)
         ]
     relative, apart = consensus(*found), np.zeros(frames)
     for frame, (dry, wet) in enumerate(zip(*found, strict=True)):

@@ -137,6 +137,7 @@ def package(
 ) -> Solution:
     """The solution that an adjusted problem stands for. panels: where not all frames were seen through the chamber."""
     problem = adjustment.problem
+    carried = versions.carried(problem)
     cameras = [
         Camera(
             problem.lensmodel,
@@ -144,7 +145,7 @@ def package(
             int(problem.sizes[i, 0]),
             int(problem.sizes[i, 1]),
             np.zeros(6) if i == 0 else problem.rt_cam_ref[0],
-            versions.carried(problem, i),
+            carried[i],
         )
         for i in range(2)
     ]

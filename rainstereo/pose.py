@@ -33,9 +33,11 @@ def transform(rt_a_b: Array, points: Array) -> Array:
 
 
 def compose(rt_a_b: Array, rt_b_c: Array) -> Array:
-    """`rt_a_c`: first b <- c, then a <- b."""
-    Ra, Rb = rotation_matrix(np.asarray(rt_a_b)[:3]), rotation_matrix(np.asarray(rt_b_c)[:3])
-    return np.concatenate([rotation_vector(Ra @ Rb), Ra @ np.asarray(rt_b_c)[3:] + np.asarray(rt_a_b)[3:]])
+    """`rt_a_c`: first b <- c, then a <- b. (..., 6); leading axes broadcast."""
+    rt_a_b, rt_b_c = np.asarray(rt_a_b, dtype=np.float64), np.asarray(rt_b_c, dtype=np.float64)
+    Ra, Rb = rotation_matrix(rt_a_b[..., :3]), rotation_matrix(rt_b_c[..., :3])
+    moved = (Ra @ rt_b_c[..., 3:, None])[..., 0] + rt_a_b[..., 3:]
+    return np.concatenate([rotation_vector(Ra @ Rb), moved], -1)
 
 
 def invert(rt_a_b: Array) -> Array:

@@ -368,22 +368,22 @@ def test_stages_run_and_are_as_exact_as_they_claim(stage: str) -> None:
 
 def test_infinity_error_is_that_of_directions_and_forgives_a_turn_of_the_whole_rig() -> None:
     from rainstereo import Rig
-    from rainstereo.apps import bench_calibration
+    from rainstereo.apps import rig_error
 
     def camera(focal: float = 600.0, shift: float = 0.0, pose: tuple[float, ...] = (0.0,) * 6) -> Camera:
         return Camera("LENSMODEL_PINHOLE", np.array([focal, focal, 320 + shift, 240]), 640, 480, np.array(pose))
 
     wet = (0.01, -0.02, 0.005, -0.03, 0.0, 0.0)
     truth = Rig(camera(), camera(pose=wet), None)
-    assert bench_calibration.infinity_error(truth, truth) < 1e-9
-    assert bench_calibration.matching_error(truth, truth) < 1e-9
+    assert rig_error.infinity_error(truth, truth) < 1e-9
+    assert rig_error.matching_error(truth, truth) < 1e-9
     # a turn of one camera by a small angle is shared out between both, and every match is off by its whole
     turned = Rig(camera(), camera(pose=(0.01 + 1e-3, *wet[1:])), None)
-    assert bench_calibration.infinity_error(turned, truth) == pytest.approx(600 * 1e-3 / 2, rel=0.2)
-    assert bench_calibration.matching_error(turned, truth) == pytest.approx(600 * 1e-3, rel=0.2)
+    assert rig_error.infinity_error(turned, truth) == pytest.approx(600 * 1e-3 / 2, rel=0.2)
+    assert rig_error.matching_error(turned, truth) == pytest.approx(600 * 1e-3, rel=0.2)
     # a wrong focal length in both matches well and points badly
     longer = Rig(camera(606), camera(606, pose=wet), None)
-    assert bench_calibration.infinity_error(longer, truth) > 5 * bench_calibration.matching_error(longer, truth)
+    assert rig_error.infinity_error(longer, truth) > 5 * rig_error.matching_error(longer, truth)
 
 
 def test_calibration_stage_finds_the_rig_and_known_panels_help() -> None:

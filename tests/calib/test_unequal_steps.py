@@ -111,6 +111,6 @@ def test_thinned_boards_tell_as_much_as_the_regular_boards_that_they_are() -> No
 def test_a_lattice_too_fine_for_mrcal_is_left_out_of_the_file() -> None:
     problem = problem_of(Board.parse("aprilgrid:4x3:24mm:0.3137"), 3)
     assert unequal_steps.as_regular(problem) is None
-    assert versions.carried(problem, 0) == {}
+    assert versions.carried(problem) == [{}, {}]
     with pytest.raises(ValueError, match="equal steps only"):
         versions.optimize(problem, outliers=True)
