@@ -315,7 +315,7 @@ class Trainer:
 
 
 def all_finite(images: Tensor) -> bool:
-    """Whether there is neither NaN nor infinity among values; in one pass, which `isfinite` takes ten times as long for."""
+    """Whether there is neither NaN nor infinity among values; in one pass, in a tenth of the time of `isfinite`."""
     return all(math.isfinite(value) for value in images.aminmax())
 
 
