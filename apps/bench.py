@@ -47,8 +47,8 @@ class Options:
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What: refraction, warp, calibration, slab, cavity, guidance, drops, rain, align, record, select, train, derain,
-    or all."""
+    """What: refraction, warp, calibration, slab, slab-images, cavity, guidance, drops, rain, align, record, select,
+    train, derain, or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15
