@@ -48,8 +48,8 @@ class Options:
     """
 
     stage: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STAGE")]
-    """What: refraction, warp, calibration, slab, cavity, guidance, drops, rain, align, record, select, train, derain,
-    cuda (where there is a GPU), or all."""
+    """What: refraction, warp, calibration, slab, slab-images, cavity, guidance, drops, rain, align, record, select,
+    train, derain, cuda (where there is a GPU), or all."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for the results."""
     repeats: int = 15

@@ -11,7 +11,7 @@ pytest.importorskip("mrcal", reason="mrcal is not installed")
 
 from rainstereo import Rig, pose
 from rainstereo.calib import mrcal_versions, uncertainty
-from rainstereo.calib.rotation import rotated_by
+from rainstereo.calib.rotation import by_rotation, rotated_by
 from rainstereo.calib.solve import Solution, solve
 from rainstereo.rig import ROLES
 
@@ -120,6 +120,16 @@ def test_derivative_of_a_rotated_point(r: list[float], p: list[float]) -> None:
         step = np.eye(3)[k] * 1e-6
         up, down = (pose.rotation_matrix(rotation + s) @ point for s in (step, -step))
         np.testing.assert_allclose(analytic[:, k], (up - down) / 2e-6, atol=1e-7)
+
+
+def test_derivatives_by_many_rotations_are_those_by_each() -> None:
+    rng = np.random.default_rng(3)
+    r, points, by_point = rng.normal(size=(5, 3)), rng.normal(size=(7, 3)), rng.normal(size=(5, 7, 2, 3))
+    r[0], r[1] = 0.0, 1e-7
+    rotated = points @ np.swapaxes(pose.rotation_matrix(r), 1, 2)
+    together = by_rotation(by_point, rotated, r[:, None])
+    for i in range(5):
+        np.testing.assert_allclose(together[i], by_point[i] @ rotated_by(r[i], points), atol=1e-14)
 
 
 def test_infinity_error_of_a_rig_with_itself_and_with_another() -> None:

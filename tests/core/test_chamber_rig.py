@@ -197,6 +197,16 @@ def test_poses_compose_and_invert_as_4x4_matrices(a: np.ndarray, b: np.ndarray) 
     np.testing.assert_allclose(transform(a, P), (matrix(a) @ [1, -2, 3, 1])[None, :3], atol=1e-13)
 
 
+def test_many_poses_compose_as_each_does(rng: np.random.Generator) -> None:
+    one, many = rng.normal(size=6), rng.normal(size=(4, 6))
+    for together, each in (
+        (compose(one, many), [compose(one, b) for b in many]),
+        (compose(many, one), [compose(a, one) for a in many]),
+        (compose(many, many[::-1]), [compose(a, b) for a, b in zip(many, many[::-1], strict=True)]),
+    ):
+        np.testing.assert_allclose(together, each, atol=1e-14)
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-9, 1e-4, 1.0, np.pi - 1e-6, np.pi - 1e-12])
 def test_rotations_near_their_singularities(angle: float) -> None:
     axis = np.array([2.0, -1, 2]) / 3
