@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from rainstereo import pose
-from rainstereo.calib import mismatch, uncertainty
+from rainstereo.calib import mismatch, pose_flips, uncertainty
 from rainstereo.calib.board_shape import BoardShape, examine
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.refracted import ChamberError
@@ -85,6 +85,7 @@ def judge(
     cov = uncertainty.covariance(solution) if cov is None else cov
     findings = [
         *views(solution),
+        *ways_round(solution),
         *cover(solution),
         *certainty(solution, cov),
         *fit(observations, solution),
@@ -136,6 +137,17 @@ def views(solution: Solution) -> list[Finding]:
         )
         found.append(Finding("refused", text, "tilt the board by 30 degrees or more, each time another way", names))
     return found
+
+
+def ways_round(solution: Solution) -> list[Finding]:
+    """Boards of which the corners do not tell which way round they stand."""
+    ties = None if solution.panels is None else solution.panels.ties
+    undecided = pose_flips.rivals(solution.problem, ties).undecided
+    if not undecided.any():
+        return []
+    text = "in the frames named the board could lean the other way just as well: it is seen from too far and too flat"
+    remedy = "hold it nearer, or lean it by 30 degrees; such frames say little, and may be left out"
+    return [Finding("note", text, remedy, tuple(solution.names[i] for i in np.flatnonzero(undecided)))]
 
 
 def distinct_views(rt_ref_board: Array, extent: float) -> list[int]:

@@ -87,7 +87,10 @@ def _unknown(solution: Solution) -> list[Finding]:
     found = [Finding("note", text)]
     for name in ("pitch", "yaw"):
         if estimate.sigmas.get(name, 0.0) > BLIND_TILT:
-            text = f"the tilt ({name}) was not found: {math.degrees(estimate.sigmas[name]):.0f} degrees uncertain"
+            degrees = math.degrees(estimate.sigmas[name])
+            text = f"the tilt ({name}) was not found: " + (
+                f"{degrees:.0f} degrees uncertain" if degrees < 90 else "nothing that the corners show depends on it"
+            )
             found.append(Finding("doubtful", text, "describe it in chamber.toml, or show the board nearer and tilted"))
     low, _ = estimate.slab.limited()
     for name, end in zip(estimate.slab.names, low, strict=True):
