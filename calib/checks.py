@@ -14,7 +14,9 @@ import numpy as np
 
 from rainstereo import pose
 from rainstereo.calib import mismatch, pose_flips, uncertainty
+from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.board_shape import BoardShape, examine
+from rainstereo.calib.damped_step import damped_step
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.refracted import ChamberError
 from rainstereo.calib.seed import StereoError
@@ -36,6 +38,7 @@ DISTINCT_TURN, DISTINCT_MOVE = np.deg2rad(6), 0.08
 FRONTAL = np.deg2rad(8)
 COVER_DOUBTFUL, COVER_CELLS = 0.4, (8, 6)
 BASELINE_OFF = 0.05
+UNSETTLED_PX, UNSETTLED_NOISE = 0.02, 0.2
 SYSTEMATIC_PX, CELL_CORNERS = 0.2, 8
 FOCALS_OFF = 0.1
 SHAPE_SIGMAS, SHAPE_DOUBTFUL_PX = 5.0, 0.1
@@ -84,6 +87,7 @@ def judge(
     """
     cov = uncertainty.covariance(solution) if cov is None else cov
     findings = [
+        *settled(solution, cov),
         *views(solution),
         *ways_round(solution),
         *cover(solution),
@@ -115,6 +119,22 @@ def judge_failure(observations: Observations, error: Exception, lensmodel: str) 
         remedy = "check the board's shape and square size, that the focus was locked, and take more pairs"
         findings.append(Finding("refused", f"the {bad} camera cannot be calibrated by itself ({told})", remedy))
     return Verdict(tuple(findings))
+
+
+def settled(solution: Solution, cov: Covariance) -> list[Finding]:
+    """Whether the solution is where the sum of squares is least: how far the next step would move the corners.
+
+    Solves through panels end by that criterion or not at all (`through_acrylic.refine`); mrcal's do not say.
+    """
+    if solution.rig.chamber is not None:
+        return []
+    at = versions.linearize(solution.problem)
+    step = damped_step((at.jacobian.T @ at.jacobian).toarray(), at.jacobian.T @ at.residuals, 1e-12)
+    moved = float(np.abs(at.jacobian[: at.boards] @ step).max())
+    if moved <= max(UNSETTLED_PX, UNSETTLED_NOISE * cov.sigma):
+        return []
+    text = f"the solve did not converge: its next step would move corners by up to {moved:.2g} px"
+    return [Finding("refused", text, f"use a simpler lens model; {MORE_VIEWS}")]
 
 
 def views(solution: Solution) -> list[Finding]:
