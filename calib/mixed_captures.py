@@ -18,7 +18,7 @@ import numpy as np
 import scipy.stats
 
 from rainstereo import pose
-from rainstereo.calib import adjust
+from rainstereo.calib import adjust, mismatch
 from rainstereo.calib.checks import Finding
 from rainstereo.calib.mrcal_versions import SolveError
 from rainstereo.calib.observations import Observations
@@ -47,6 +47,8 @@ ZOOMED, ZOOMED_SIGMAS = 0.01, 8.0
 """A single frame is named where its focal length is off by this share and by so many sigmas: no mishap does that."""
 WILD = 25.0
 """A frame this many times farther from its group than usual belongs to none."""
+SLIGHT = 0.1
+"""A simpler difference is told where what it leaves unexplained moves corners by less than this share of all."""
 PLAIN = 25.0
 """Squared sigmas by which the other group has to suit a frame better for it to change sides."""
 STARTS, ROUNDS = 8, 12
@@ -90,18 +92,42 @@ def examine(observations: Observations, solution: Solution, through: Mask | None
     divisions = [found for columns in WAYS.values() if (found := _divided(own, list(columns))) is not None]
     if not divisions:
         return _single(own, solution)
-    best = min(divisions, key=lambda each: each.left)
+    candidates: dict[tuple[str, ...], _Division] = {}
+    for division in sorted(divisions, key=lambda each: each.p):
+        candidates.setdefault(tuple(sorted(division.frames)), division)
+    told = [_described(observations, solution, through, division) for division in candidates.values()]
+    apart = [each for each in told if each is not None]
+    if not apart:
+        first = next(iter(candidates.values()))
+        return _read_off(solution, own, first)[1]
+    return min(apart, key=lambda each: each[0])[1]
+
+
+def _described(
+    observations: Observations, solution: Solution, through: Mask | None, division: _Division
+) -> tuple[float, Mixture] | None:
+    """A division as a calibration of its larger group shows it, and square pixels that it leaves; None: that failed."""
     try:
-        clean, after = _larger_alone(observations, solution, through, best)
+        clean, own = _larger_alone(observations, solution, through, division)
     except (SolveError, ValueError):
-        clean, after = solution, own
-    mine, theirs = (np.isin(np.array(after.names), names) for names in (best.frames, best.others))
-    described = [_compared(after, list(columns), mine, theirs) for columns in WAYS.values()]
-    number = int(np.argmin([each.left for each in described]))
-    way = list(WAYS)[number]
-    mine, theirs = _sorted(after, list(WAYS[way]), mine, theirs)
-    found = _compared(after, list(WAYS[way]), mine, theirs)
-    return _mixture(clean, after, way, replace(found, p=best.p), mine)
+        return None
+    return _read_off(clean, own, division)
+
+
+def _read_off(solution: Solution, own: Own, division: _Division) -> tuple[float, Mixture]:
+    """In which way the groups differ, and square pixels that stay unexplained."""
+    mine, theirs = (np.isin(np.array(own.names), names) for names in (division.frames, division.others))
+    compared = {way: _compared(own, list(columns), mine, theirs) for way, columns in WAYS.items()}
+    best = min(compared, key=lambda each: compared[each].left)
+    slight = (SLIGHT * _shows(own, list(WAYS[best]), compared[best].step, mine) / own.noise) ** 2
+    enough = compared[best].left + slight * 2 * float(own.corners[mine].sum())
+    way = min(
+        (each for each in WAYS if compared[each].left <= enough),
+        key=lambda each: (len(WAYS[each]), compared[each].left),
+    )
+    mine, theirs = _sorted(own, list(WAYS[way]), mine, theirs)
+    found = _compared(own, list(WAYS[way]), mine, theirs)
+    return compared[way].left * own.noise**2, _mixture(solution, own, way, replace(found, p=division.p), mine)
 
 
 def _larger_alone(
@@ -120,7 +146,8 @@ def _larger_alone(
 def of_frames(observations: Observations, solution: Solution, through: Mask | None = None) -> Own:
     """Each frame's own rig, of those used and of those dropped for what they show."""
     place = {name: i for i, name in enumerate(observations.names)}
-    strange = [place[drop.name] for drop in solution.dropped if drop.reason != adjust.TOO_LITTLE]
+    mute = (adjust.TOO_LITTLE, mismatch.EXCHANGED)  # the latter are of this rig, and it is said what they are
+    strange = [place[drop.name] for drop in solution.dropped if not drop.reason.startswith(mute)]
     behind = np.ones(len(observations), dtype=np.bool_) if through is None else through
     return own_rigs(solution.problem, solution.names, _strangers(observations, strange, solution.rig.chamber, behind))
 

@@ -26,6 +26,8 @@ CORE = Free(core=True)
 ENOUGH = 24
 """Coordinates that a frame must have more than twenty-four of to have a say: ten more than it has numbers."""
 ROUNDS, STANDS_OUT = 5, 4.0
+MISFIT, MOST = 4.0, 0.6
+"""A frame far from the others has a say if this many times the noise is left at most, of this share of its corners."""
 FLOOR_PX = 0.01
 """Exact corners are off by their rounding; no noise is taken to be less."""
 
@@ -58,16 +60,17 @@ def own_rigs(
     problem = known.copy(free=CORE, regularization=False)
     np.abs(problem.observations[..., 2], out=problem.observations[..., 2])
     values, weight, corners, square = _linear(problem)
-    rest = [_alone(known, seen[:, [i]], chamber) for _, seen, chamber in strangers for i in range(seen.shape[1])]
-    strange = [name for each, _, _ in strangers for name in each]
     telling = 2 * corners > ENOUGH
     each = square[telling] / (2 * corners[telling] - len(NAMES) - 6)
+    noise = max(float(np.sqrt(np.median(each))) if len(each) else 0.0, FLOOR_PX)
+    rest = [_alone(known, seen[:, [i]], chamber, noise) for _, seen, chamber in strangers for i in range(seen.shape[1])]
+    strange = [name for each, _, _ in strangers for name in each]
     return Own(
         (*names, *strange),
         np.concatenate([values, *(found[0][None] for found in rest)]),
         np.concatenate([weight, *(found[1][None] for found in rest)]),
         np.concatenate([corners, *(np.atleast_1d(found[2]) for found in rest)]),
-        max(float(np.sqrt(np.median(each))) if len(each) else 0.0, FLOOR_PX),
+        noise,
         np.arange(len(names) + len(rest)) < len(names),
     )
 
@@ -118,8 +121,11 @@ def _design(problem: Problem) -> tuple[Array, Array, Mask]:
     return A.reshape(frames, 2 * per_view, -1), off.reshape(frames, -1), there.reshape(frames, -1)
 
 
-def _alone(known: Problem, corners: Array, chamber: Chamber | None) -> tuple[Array, Array, float]:
-    """Values, weight and corners of one frame, (cameras, 1, rows, columns, 2), that may be far from the others."""
+def _alone(known: Problem, corners: Array, chamber: Chamber | None, noise: float) -> tuple[Array, Array, float]:
+    """Values, weight and corners of one frame, (cameras, 1, rows, columns, 2), that may be far from the others.
+
+    Nothing from corners that no rig explains: blurred ones, or those of another board.
+    """
     nothing = np.zeros(len(NAMES)), np.zeros((len(NAMES), len(NAMES))), 0.0
     try:
         problem, placed = posing.place(known, corners, chamber)
@@ -144,5 +150,8 @@ def _alone(known: Problem, corners: Array, chamber: Chamber | None) -> tuple[Arr
     found = scipy.optimize.least_squares(residual, start, loss="soft_l1", x_scale="jac", max_nfev=60).x
     if not np.isfinite(found).all() or not (np.abs(found[6:8]) < 2).all():
         return nothing
-    values, weight, count, _ = _linear(with_own(found))
+    values, weight, count, square = _linear(with_own(found))
+    left = float(np.sqrt(square[0] / max(2 * count[0] - len(start), 1)))
+    if left > MISFIT * noise or count[0] < MOST * seen.sum():
+        return nothing
     return values[0] + found[6:], weight[0], float(count[0])

@@ -90,6 +90,24 @@ def test_one_rig_raises_no_alarm(noise: float, outliers: float, behind: bool) ->
     assert mixed_captures.doubts(None) == []
 
 
+@pytest.mark.parametrize(
+    "mishap", ["shift", pytest.param("exchange", marks=pytest.mark.slow), pytest.param("blur", marks=pytest.mark.slow)]
+)
+def test_frames_that_are_dropped_for_other_reasons_are_not_another_rigs(mishap: str) -> None:
+    seen, _ = taken()
+    dry, wet = seen.dry.copy(), seen.wet.copy()
+    if mishap == "shift":
+        wet[[2, 9]] = seen.wet[[9, 2]]
+    elif mishap == "exchange":
+        dry[[2, 9]], wet[[2, 9]] = seen.wet[[2, 9]], seen.dry[[2, 9]]
+    else:
+        wet[[2, 9]] += np.random.default_rng(1).normal(size=wet[[2, 9]].shape) * 6
+    spoiled = replace(seen, dry=dry, wet=wet)
+    solution = solve(spoiled, "LENSMODEL_OPENCV5")
+    assert {drop.name for drop in solution.dropped} == {"002.png", "009.png"}
+    assert mixed_captures.examine(spoiled, solution) is None
+
+
 @pytest.mark.slow
 def test_paired_captures_are_one_rig() -> None:
     seen, _, rt, _ = capture("paired", CASES["20 % outliers"])
@@ -124,7 +142,7 @@ def test_focus_under_stress(noise: float, outliers: float, behind: bool, count: 
                         count=count)  # fmt: skip
     mixture = found(seen, behind=behind)
     assert mixture is not None
-    assert len(set(mixture.frames) ^ these) <= (2 if noise == 1.0 else 0)
+    assert len(set(mixture.frames) ^ these) <= (4 if noise == 1.0 else 0)  # of thirty
     assert abs(mixture.focal[1] - mixture.focal[0] + 0.005) < 4 * np.hypot(*mixture.focal_sd)
 
 
