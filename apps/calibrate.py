@@ -18,7 +18,15 @@ from rainstereo.apps.calibration_page import page
 from rainstereo.apps.calibration_slab import slab_results
 from rainstereo.apps.cli import DONE, FAILED
 from rainstereo.apps.run_record import Record
-from rainstereo.calib import board_shape, checks, consistency, mrcal_versions, panel_checks, uncertainty
+from rainstereo.calib import (
+    board_shape,
+    checks,
+    consistency,
+    mixed_captures,
+    mrcal_versions,
+    panel_checks,
+    uncertainty,
+)
 from rainstereo.calib.board import Board
 from rainstereo.calib.cross_validation import choose_lensmodel
 from rainstereo.calib.hypotheses import Hypothesis, compare
@@ -119,6 +127,9 @@ def examine(options: Options, captures: Captures, clock: Clock) -> Findings:
         observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance, shape=shape
     )
     clock("uncertainty and checks")
+    mixture = mixed_captures.examine(observations, solution, captures.sought and captures.sought.through)
+    verdict = checks.Verdict((*verdict.findings, *mixed_captures.doubts(mixture)))
+    clock("one rig, one state")
     hypotheses: tuple[Hypothesis, ...] = ()
     if chamber is not None and chamber.panels:
         hypotheses = compare(solution, chamber)
@@ -129,7 +140,9 @@ def examine(options: Options, captures: Captures, clock: Clock) -> Findings:
         comparisons = consistency.compare(solution)
         verdict = checks.Verdict((*verdict.findings, *consistency.doubts(comparisons)))
         clock("cross-validation")
-    return Findings(observations, solution, covariance, choice, verdict, chamber, comparisons, hypotheses, shape)
+    return Findings(
+        observations, solution, covariance, choice, verdict, chamber, comparisons, hypotheses, shape, mixture
+    )
 
 
 class Clock:
@@ -256,6 +269,7 @@ def results(findings: Findings, clock: Clock) -> dict[str, object]:
         "reordered": solution.reordered,
         "board_warp_m": solution.calobject_warp,
         "board_shape": findings.shape,
+        "mixed_captures": findings.mixture,
         "refraction": solution.passes,
         "panels": slab_results(findings),
         "solve_seconds": solution.solve_seconds,

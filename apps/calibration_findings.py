@@ -16,6 +16,7 @@ from rainstereo.calib.consistency import Comparison
 from rainstereo.calib.contributions import CORNERS, Contributions
 from rainstereo.calib.cross_validation import Choice
 from rainstereo.calib.hypotheses import Hypothesis
+from rainstereo.calib.mixed_captures import Mixture
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.solve import Solution
 from rainstereo.calib.uncertainty import Covariance, UncertaintyMap
@@ -38,7 +39,8 @@ class Findings:
     """All that a calibration found out; `solution` and what hangs on it are None where it failed.
 
     comparisons: of parts of the capture with each other; None where that was not asked for. hypotheses: about the
-    panels; empty where there are none. shape: of the board beyond what is modelled.
+    panels; empty where there are none. shape: of the board beyond what is modelled. mixture: two states of the rig
+    among the frames, None where there is one.
     """
 
     observations: Observations
@@ -50,6 +52,7 @@ class Findings:
     comparisons: tuple[Comparison, ...] | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
     shape: BoardShape | None = None
+    mixture: Mixture | None = None
 
     @cached_property
     def spread(self) -> Contributions | None:

@@ -25,12 +25,13 @@ from rainstereo.apps.watch_screen import Screen
 from rainstereo.apps.watch_server import PageServer, Served
 from rainstereo.apps.watch_session import Session
 from rainstereo.apps.watch_state import State
-from rainstereo.calib import mrcal_versions
+from rainstereo.calib import mixed_captures, mrcal_versions
 from rainstereo.calib.board import Board
 from rainstereo.calib.checks import MORE_VIEWS, Finding, Verdict
 from rainstereo.calib.incremental import AUTOMATIC, FEWEST, SPLINED
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.rejection import NotEnoughData, Rejection
+from rainstereo.calib.solve import Dropped
 from rainstereo.rig import ROLES
 
 BETWEEN_LOOKS_S = 0.15
@@ -157,7 +158,22 @@ def _final(session: Session, options: calibrate.Options, chamber: Chamber | None
     clock("detection")
     observations = replace(observations, rejected=(*observations.rejected, *rejected))
     captures = Captures(observations, chamber, None, (observations, chamber))
-    return calibrate.examine(options, captures, clock)
+    return _with_rejected(session, calibrate.examine(options, captures, clock))
+
+
+def _with_rejected(session: Session, findings: Findings) -> Findings:
+    """Whether pairs that did not fit in while capturing were of another focus or rig: these are not in the solution."""
+    running = session.running
+    if running is None or running.solution is None or findings.solution is None or findings.mixture is not None:
+        return findings
+    misfits = [name for name in running.names("rejected") if name in running.views]
+    if not misfits:
+        return findings
+    seen = running.observations([*running.solution.names, *misfits])
+    dropped = tuple(Dropped(name, running.judged[name].reason) for name in misfits)
+    mixture = mixed_captures.examine(seen, replace(running.solution, dropped=dropped))
+    told = (*findings.verdict.findings, *mixed_captures.doubts(mixture))
+    return replace(findings, mixture=mixture, verdict=Verdict(told))
 
 
 def _nothing(session: Session, pairs: int, rejected: list[Rejection], why: str = "") -> Findings:

@@ -13,8 +13,10 @@ from typing import Literal
 import numpy as np
 
 from rainstereo import pose
-from rainstereo.calib import mismatch, uncertainty
+from rainstereo.calib import mismatch, pose_flips, uncertainty
+from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.board_shape import BoardShape, examine
+from rainstereo.calib.damped_step import damped_step
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.refracted import ChamberError
 from rainstereo.calib.seed import StereoError
@@ -36,6 +38,7 @@ DISTINCT_TURN, DISTINCT_MOVE = np.deg2rad(6), 0.08
 FRONTAL = np.deg2rad(8)
 COVER_DOUBTFUL, COVER_CELLS = 0.4, (8, 6)
 BASELINE_OFF = 0.05
+UNSETTLED_PX, UNSETTLED_NOISE = 0.02, 0.2
 SYSTEMATIC_PX, CELL_CORNERS = 0.2, 8
 FOCALS_OFF = 0.1
 SHAPE_SIGMAS, SHAPE_DOUBTFUL_PX = 5.0, 0.1
@@ -84,7 +87,9 @@ def judge(
     """
     cov = uncertainty.covariance(solution) if cov is None else cov
     findings = [
+        *settled(solution, cov),
         *views(solution),
+        *ways_round(solution),
         *cover(solution),
         *certainty(solution, cov),
         *fit(observations, solution),
@@ -116,6 +121,22 @@ def judge_failure(observations: Observations, error: Exception, lensmodel: str) 
     return Verdict(tuple(findings))
 
 
+def settled(solution: Solution, cov: Covariance) -> list[Finding]:
+    """Whether the solution is where the sum of squares is least: how far the next step would move the corners.
+
+    Solves through panels end by that criterion or not at all (`through_acrylic.refine`); mrcal's do not say.
+    """
+    if solution.rig.chamber is not None:
+        return []
+    at = versions.linearize(solution.problem)
+    step = damped_step((at.jacobian.T @ at.jacobian).toarray(), at.jacobian.T @ at.residuals, 1e-12)
+    moved = float(np.abs(at.jacobian[: at.boards] @ step).max())
+    if moved <= max(UNSETTLED_PX, UNSETTLED_NOISE * cov.sigma):
+        return []
+    text = f"the solve did not converge: its next step would move corners by up to {moved:.2g} px"
+    return [Finding("refused", text, f"use a simpler lens model; {MORE_VIEWS}")]
+
+
 def views(solution: Solution) -> list[Finding]:
     """Whether the boards' poses differ enough to determine the lenses."""
     distinct = distinct_views(solution.rt_ref_board, _board_extent(solution))
@@ -136,6 +157,17 @@ def views(solution: Solution) -> list[Finding]:
         )
         found.append(Finding("refused", text, "tilt the board by 30 degrees or more, each time another way", names))
     return found
+
+
+def ways_round(solution: Solution) -> list[Finding]:
+    """Boards of which the corners do not tell which way round they stand."""
+    ties = None if solution.panels is None else solution.panels.ties
+    undecided = pose_flips.rivals(solution.problem, ties).undecided
+    if not undecided.any():
+        return []
+    text = "in the frames named the board could lean the other way just as well: it is seen from too far and too flat"
+    remedy = "hold it nearer, or lean it by 30 degrees; such frames say little, and may be left out"
+    return [Finding("note", text, remedy, tuple(solution.names[i] for i in np.flatnonzero(undecided)))]
 
 
 def distinct_views(rt_ref_board: Array, extent: float) -> list[int]:

@@ -30,6 +30,8 @@ SETTLED = 0.01
 """Relative change of the noise at which it counts as known."""
 BLIND_TILT = np.deg2rad(10.0)
 """A normal that is less certain than this has not been found."""
+UNKNOWN = 1e3
+"""Standard deviation, in any unit, of what nothing depends on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,4 +162,7 @@ def _covariance(problem: Problem, normal: Normal, panels: Panels) -> tuple[Covar
     sigma = float(np.sqrt(square / freedom)) if freedom > 0 else float("inf")
     packed = panels.spread(normal.layout, panels.spread(normal.layout, inverse @ noisy @ inverse).T)
     matrix = packed * np.outer(normal.scale, normal.scale) * sigma**2
+    slab = np.arange(normal.layout.slab.start, normal.layout.slab.stop)
+    blind = slab[np.diag(noisy)[slab] <= 0]  # the tilt of panels that came out with no thickness
+    matrix[blind, blind] = UNKNOWN**2
     return Covariance((matrix + matrix.T) / 2, normal.layout, sigma, condition), square, freedom

@@ -15,6 +15,7 @@ from rainstereo.types import Array
 
 FITS_PX = 1.0
 FITS_FACTOR = 4.0
+EXCHANGED = "its two images are exchanged"
 
 
 def explain(adjustment: Adjustment, chamber: Chamber | None) -> tuple[Dropped, ...]:
@@ -49,7 +50,7 @@ def frame_fit(known: Problem, corners: Array, chamber: Chamber | None) -> Array:
 
 def _cause(reason: str, dry: float, wet: float, exchanged: float, limit: float) -> str:
     if exchanged < limit:
-        return f"its two images are exchanged: the other way round they fit to {exchanged:.2f} px"
+        return f"{EXCHANGED}: the other way round they fit to {exchanged:.2f} px"
     if dry < limit and wet < limit:
         return (
             f"each image fits alone (dry {dry:.2f}, wet {wet:.2f} px) but not both together: they were not taken at "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rainstereo.calib import mrcal_versions as versions
+from rainstereo.calib import pose_flips
 from rainstereo.calib.adjust import Adjustment, Solver, observed
 from rainstereo.calib.mrcal_versions import Problem
 from rainstereo.types import Array
@@ -14,16 +15,26 @@ MAX_OUTLIER_FRACTION = 0.25
 OUTLIER_SIGMAS = 5.0
 OUTLIER_FLOOR_PX = 0.1
 ROUNDS = 10
+TURNS = 2
+"""Rounds in which boards that stand the wrong way round are turned."""
 
 
 def reject(adjustment: Adjustment, solver: Solver) -> None:
-    """Solve with `solver` and reject outliers; frames that lose too much are dropped, the rest is solved again."""
+    """Solve with `solver` and reject outliers; frames that lose too much are dropped, the rest is solved again.
+
+    Boards that turn out to stand the wrong way round are turned before any frame is blamed.
+    """
+    turns = TURNS
     while True:
         problem = adjustment.problem
         for _ in range(ROUNDS):
             solver(adjustment)
             if not mark_outliers(problem):
                 break
+        if turns and pose_flips.undo(problem):
+            turns -= 1
+            readmit(problem)
+            continue
         lost = lost_fraction(problem)
         bad = lost > MAX_OUTLIER_FRACTION
         if not bad.any():

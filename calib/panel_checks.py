@@ -19,6 +19,8 @@ THIN, THICK = 2e-4, 0.03
 LOW_INDEX, HIGH_INDEX = 1.25, 1.95
 STEEP = math.radians(70)
 FAR = 1.0
+CERTAIN_TILT, CERTAIN_THICKNESS = math.radians(0.01), 1e-7
+"""Standard deviations below which nobody measures; 0 says on purpose that something is exact."""
 CONTRADICTION = 3.0
 """A description that corners pull away by more sigmas than this is questioned."""
 
@@ -36,6 +38,14 @@ def questions(chamber: Chamber) -> list[Finding]:
     if chamber.tilt > STEEP:
         text = f"the panels are described as tilted by {math.degrees(chamber.tilt):.0f} degrees"
         found.append(Finding("doubtful", text, "normal points from the cameras to the scene; x right, y down, z ahead"))
+    sd = chamber.uncertainty
+    if sd is not None and 0 < sd.tilt < CERTAIN_TILT:
+        text = f"the tilt is described as known to {math.degrees(sd.tilt):.2g} degrees"
+        found.append(Finding("doubtful", text, "tilt_sd_deg is in degrees, not radians: 0.5 for a protractor"))
+    for i, each in enumerate(() if sd is None else sd.thickness):
+        if 0 < each < CERTAIN_THICKNESS:
+            text = f"the thickness of panel {i + 1} is described as known to {each * 1000:.2g} mm"
+            found.append(Finding("doubtful", text, "thickness_sd_mm is in millimetres: 0.02 for a caliper"))
     if chamber.distance > FAR:
         text = f"the panels are described as {chamber.distance * 1000:g} mm away"
         found.append(Finding("doubtful", text, "distance_mm is in millimetres"))
@@ -87,7 +97,10 @@ def _unknown(solution: Solution) -> list[Finding]:
     found = [Finding("note", text)]
     for name in ("pitch", "yaw"):
         if estimate.sigmas.get(name, 0.0) > BLIND_TILT:
-            text = f"the tilt ({name}) was not found: {math.degrees(estimate.sigmas[name]):.0f} degrees uncertain"
+            degrees = math.degrees(estimate.sigmas[name])
+            text = f"the tilt ({name}) was not found: " + (
+                f"{degrees:.0f} degrees uncertain" if degrees < 90 else "nothing that the corners show depends on it"
+            )
             found.append(Finding("doubtful", text, "describe it in chamber.toml, or show the board nearer and tilted"))
     low, _ = estimate.slab.limited()
     for name, end in zip(estimate.slab.names, low, strict=True):

@@ -29,6 +29,8 @@ AGREE = 0.35
 not belong together; views that do, through a lens known only roughly, stay below 0.15."""
 CLOSE = 1.5
 """A lens that fits this many times worse than the other is not tried."""
+NEARLY = 1.1
+"""Equal focal lengths that fit this many times worse than different ones are tried, too."""
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_STEREOGRAPHIC")
 
 
@@ -142,11 +144,43 @@ def seed(points: Array, corners: Array, sizes: list[tuple[int, int]], *, reversi
             "the board's shape is not the one given"
         )
     total = {lens: sum(s[0] for s in best[lens]) for lens in complete}
+    refused: StereoError | None = None
+    given = 0
     for lens in sorted(
         (name for name in complete if total[name] <= CLOSE * min(total.values())), key=total.__getitem__
     ):
-        focals = np.array([s[2] for s in best[lens]])
-        yield _joined(points, corners, sizes, lens, focals, reversible)
+        separate = np.array([s[2] for s in best[lens]])
+        shared = _alike(scans, lens, sizes)
+        guesses = [separate] if shared is None or np.allclose(shared, separate) else [separate, shared]
+        for focals in guesses:
+            try:
+                guess = _joined(points, corners, sizes, lens, focals, reversible)
+            except StereoError as error:
+                refused = refused or error
+                continue
+            given += 1
+            yield guess
+    if not given and refused is not None:
+        raise refused
+
+
+def _alike(scans: list[list[tuple[float, str, float]]], lens: str, sizes: list[tuple[int, int]]) -> Array | None:
+    """The focal lengths, (cameras,), of the best guess in which all cameras see as wide; None where that fits worse.
+
+    Noise of a pixel leaves the focal length of a single camera open, and two that differ by mistake tell two stories.
+    """
+    widths = [size[0] for size in sizes]
+    found = [
+        {round(focal / width, 9): error for error, name, focal in options if name == lens}
+        for options, width in zip(scans, widths, strict=True)
+    ]
+    common = {wide: sum(each[wide] for each in found) for wide in found[0] if all(wide in each for each in found)}
+    if not common:
+        return None
+    wide = min(common, key=common.__getitem__)
+    if common[wide] > NEARLY * sum(min(each.values()) for each in found):
+        return None
+    return wide * np.array(widths, dtype=np.float64)
 
 
 def scan(points: Array, views: Array, size: tuple[int, int]) -> list[tuple[float, str, float]]:

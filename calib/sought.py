@@ -8,7 +8,7 @@ import numpy as np
 import scipy.stats
 
 from rainstereo import pose
-from rainstereo.calib import joint, outliers, through_acrylic
+from rainstereo.calib import joint, outliers, pose_flips, through_acrylic
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.adjust import Adjustment
 from rainstereo.calib.joint import Estimate
@@ -66,12 +66,16 @@ def find(adjustment: Adjustment, sought: Sought, noise_px: float) -> tuple[Panel
     if panels.ties is not None:
         loose = _elsewhere(adjustment.problem, panels.ties)
         panels.ties = np.where(loose, np.arange(len(loose)), panels.ties).astype(np.intp)
+    turns = outliers.TURNS
     for _ in range(ROUNDS):
         estimate = joint.estimate(adjustment.problem, seen, panels)
         fresh = _moved(adjustment.problem, panels, apart, noise_px)
         if fresh.any() and panels.ties is not None:
             panels.ties = np.where(fresh, np.arange(len(fresh)), panels.ties).astype(np.intp)
             loose |= fresh
+        elif turns and pose_flips.undo(adjustment.problem, panels.ties):
+            turns -= 1
+            outliers.readmit(adjustment.problem)
         elif not outliers.mark_outliers(adjustment.problem):
             break
     if sought.wedge:

@@ -37,7 +37,8 @@ def regular_inverse(normal: Array) -> tuple[Array, float]:
 
     Directions that are not determined get a large finite variance, so that what does not depend on them stays known.
     """
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    diagonal = np.diag(normal)
+    scale = 1 / np.sqrt(np.maximum(diagonal, 1e-30 * max(float(diagonal.max()), 1e-200)))
     w, U = scipy.linalg.eigh(normal * np.outer(scale, scale), driver="evd", check_finite=False)
     condition = float(w[-1] / max(w[0], w[-1] * 1e-17))
     w = np.maximum(w, w[-1] * RECIPROCAL_CONDITION)

@@ -1,6 +1,7 @@
 """`rainstereo calibrate` end to end: real sets, the digital rig against its truth, and captures that deserve no rig."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -237,3 +238,88 @@ def test_without_mrcal_it_says_so_before_it_searches(
     assert "apt-get install python3-mrcal" in told
     assert "pairs show the board" not in told
     assert "report it" not in told
+
+
+PANELS = """normal = [0.0, 0.2588, 0.9659]
+distance_mm = 40.0
+gaps_mm = [20.0]
+[[panel]]
+thickness_mm = 4.0
+index = 1.49
+[[panel]]
+thickness_mm = 4.0
+index = 1.49
+"""
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "told"),
+    [
+        ("thickness_mm = 4.0", "thickness_mm = 4000", "a panel 4.0 m thick was given; expected metres"),
+        ("index = 1.49", "index = 149", "a refractive index of 149 was given; expected 1 to 4.5 (acrylic 1.49"),
+        ("distance_mm", "tilt_deg = 15\ndistance_mm", "has tilt_deg, which means nothing here"),
+        ("distance_mm", "tilt_sd_deg = 57\ndistance_mm", "standard deviation of the tilt of 0.994838 rad was given"),
+    ],
+)
+def test_panels_that_cannot_be_are_refused_before_any_search(
+    boards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], right: str, wrong: str, told: str
+) -> None:
+    (tmp_path / "chamber.toml").write_text(PANELS.replace(right, wrong, 1))
+    out = tmp_path / "rig"
+    assert calibrate(boards / "dry", boards / "wet", out, "--chamber", str(tmp_path / "chamber.toml")) == 2
+    assert told in words(capsys)
+    assert not out.exists()
+
+
+def test_panels_that_are_hardly_meant_are_questioned_and_held_against_the_corners(
+    boards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A first panel in metres, a tilt in radians, and a normal that is 20 degrees off."""
+    described = PANELS.replace("thickness_mm = 4.0", "thickness_mm = 0.004", 1).replace("0.2588", "-0.09")
+    (tmp_path / "chamber.toml").write_text(described.replace("distance_mm", "tilt_sd_deg = 0.0087\ndistance_mm"))
+    more = ("--chamber", str(tmp_path / "chamber.toml"), "--slab", "estimated", "--lensmodel", "LENSMODEL_OPENCV5",
+            "--no-cross-validate")  # fmt: skip
+    calibrate(boards / "dry", boards / "wet", tmp_path / "rig", *more)
+    told = words(capsys)
+    assert "doubtful: panel 1 is described as 0.004 mm thick -> thickness_mm is in millimetres" in told
+    assert "doubtful: the tilt is described as known to 0.0087 degrees -> tilt_sd_deg is in degrees, not rad" in told
+    assert re.search(
+        r"the corners contradict the description of the panels: pitch is pulled by [+-]\d+\.\d sigmas", told
+    )
+    assert report(tmp_path / "rig")["status"] != "good"
+    assert "is pulled by" in (tmp_path / "rig" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("slab", ["known", "estimated"])
+def test_a_solve_that_does_not_converge_writes_no_rig(
+    boards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, slab: str
+) -> None:
+    monkeypatch.setattr("rainstereo.calib.through_acrylic.MAX_PASSES", 1)
+    (tmp_path / "chamber.toml").write_text(PANELS)
+    more = ("--chamber", str(tmp_path / "chamber.toml"), "--slab", slab, "--lensmodel", "LENSMODEL_OPENCV5")
+    assert calibrate(boards / "dry", boards / "wet", tmp_path / "rig", *more) == 1
+    assert refused(tmp_path / "rig")
+    assert "did not settle: after 1 passes" in words(capsys)
+    assert report(tmp_path / "rig")["status"] == "refused"
+
+
+def test_frames_of_another_focus_are_told_apart(
+    recording: Path, boards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The dry camera's focal length is a hundredth longer in four of twelve pairs."""
+    changed = ["001", "004", "006", "009"]
+    for name in changed:
+        image = cv2.imread(str(boards / "dry" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+        centre = Rig.load(recording / "truth").dry.intrinsics[2:4]
+        zoom = np.column_stack([1.01 * np.eye(2), -0.01 * centre])
+        zoomed = cv2.warpAffine(image, zoom, image.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        cv2.imwrite(str(boards / "dry" / f"{name}.png"), zoomed)
+    more = ("--chamber", str(recording / "truth" / "chamber.toml"), "--lensmodel", "LENSMODEL_OPENCV5",
+            "--no-cross-validate")  # fmt: skip
+    calibrate(boards / "dry", boards / "wet", tmp_path / "rig", *more)
+    told, mixed = words(capsys), report(tmp_path / "rig")["mixed_captures"]
+    assert mixed["way"] == "dry focus"
+    assert sorted(mixed["frames"]) == changed
+    assert mixed["focal"][0] == pytest.approx(0.01, abs=max(4 * mixed["focal_sd"][0], 1e-3))
+    assert "doubtful: the 4 frames named were taken with another focus than the other 8" in told
+    assert "taken with another focus" in (tmp_path / "rig" / "report.html").read_text()

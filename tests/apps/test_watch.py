@@ -182,6 +182,21 @@ def test_ctrl_c_writes_what_there_is(folder: Folder, tmp_path: Path, monkeypatch
 
 
 @pytest.mark.usefixtures("interrupted_when_idle")
+def test_pairs_of_another_focus_are_named_at_the_end(folder: Folder, tmp_path: Path) -> None:
+    """While capturing they only did not fit in; what they have in common is found at the end."""
+    dry = folder.truth.dry
+    changed = replace(dry, intrinsics=dry.intrinsics * np.array([1.02, 1.02, *([1.0] * (len(dry.intrinsics) - 2))]))
+    zoomed = exact_observations(replace(folder.truth, dry=changed), BOARD, board_poses(folder.truth, BOARD, PAIRS, 1))
+    folder.corners["dry"][6:] = zoomed[0][6:] + np.random.default_rng(5).normal(0, 0.1, zoomed[0][6:].shape)
+    folder.pairs(PAIRS)
+    assert folder.command(tmp_path / "rig", "--target", "0.01px", "--no-cross-validate") == 0
+    report = told(tmp_path / "rig")
+    assert sorted(report["mixed_captures"]["frames"]) == ["006", "007", "008"]
+    assert any("another focus" in finding["text"] for finding in report["findings"])
+    assert report["status"] == "doubtful"
+
+
+@pytest.mark.usefixtures("interrupted_when_idle")
 def test_too_little_writes_a_report_and_no_rig(folder: Folder, tmp_path: Path) -> None:
     folder.pairs(2)
     assert folder.command(tmp_path / "rig") == 1

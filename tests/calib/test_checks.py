@@ -1,12 +1,14 @@
 """Verdicts: what is good is called good, what is degenerate is refused, and the frames concerned are named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("mrcal", reason="mrcal is not installed")
 
 from rainstereo import Chamber, Panel, pose
-from rainstereo.calib import checks
+from rainstereo.calib import checks, uncertainty
 from rainstereo.calib.checks import Verdict
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.solve import solve
@@ -177,3 +179,14 @@ def test_distinct_views_counts_turns_and_moves() -> None:
     assert checks.distinct_views(same, 0.1) == [0]
     turned, moved = base + [0.3, 0, 0, 0, 0, 0], base + [0, 0, 0, 0.2, 0, 0]
     assert checks.distinct_views(np.array([base, turned, moved]), 0.1) == [0, 1, 2]
+
+
+def test_a_state_that_is_not_at_the_minimum_is_refused(plenty: Observations) -> None:
+    solution = solve(plenty, "LENSMODEL_OPENCV5")
+    cov = uncertainty.covariance(solution)
+    assert checks.settled(solution, cov) == []
+    away = solution.problem.copy()
+    away.intrinsics[0, :2] *= 1.001
+    (finding,) = checks.settled(replace(solution, problem=away), cov)
+    assert finding.severity == "refused"
+    assert "did not converge" in finding.text

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("mrcal", reason="mrcal is not installed")
 
-from rainstereo.calib import checks, mrcal_versions
+from rainstereo.calib import checks, mixed_captures, mrcal_versions
 from rainstereo.calib.board import Board
 from rainstereo.calib.cross_validation import choose_lensmodel
 from rainstereo.calib.observations import Observations
@@ -59,6 +59,7 @@ def test_real_set(real: RealSet, shared_data: Path, tmp_path: Path) -> None:
     verdict = checks.judge(seen, solution)
     doubts = [finding.text for finding in verdict.findings if finding.severity != "note"]
     assert ["the board is twisted" in text for text in doubts] == [True] * real.twisted, verdict.findings
+    assert mixed_captures.examine(seen, solution) is None
     solution.rig.save(tmp_path / "rig")
     model = mrcal_versions.load().cameramodel(str(tmp_path / "rig" / "wet.cameramodel"))
     np.testing.assert_array_equal(model.intrinsics()[1], solution.rig.wet.intrinsics)

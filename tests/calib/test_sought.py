@@ -14,11 +14,13 @@ from rainstereo.calib.prior import Prior
 from rainstereo.calib.slab import across
 from rainstereo.calib.solve import Solution, solve
 from rainstereo.calib.sought import Sought
+from rainstereo.chamber import ChamberUncertainty
 
 from . import synthetic
 
 COUNT = 9
 TRUE = synthetic.chamber(15)
+ACRYLIC = Chamber((0, 0, 1), 0.04, (Panel(0.004, 1.49),))
 
 
 def described(true: Chamber) -> Chamber:
@@ -126,8 +128,15 @@ def test_a_description_that_corners_contradict_is_reported_with_its_pull() -> No
         (Chamber((0, 0, 1), 0.04, (Panel(0.004, 4.0),)), "index of 4"),
         (Chamber((0, 0, 1), 40.0, (Panel(0.004, 1.49),)), "40000 mm away"),
         (Chamber((0, 1, 0.1), 0.04, (Panel(0.004, 1.49),)), "tilted by 84 degrees"),
+        (replace(ACRYLIC, uncertainty=ChamberUncertainty((2e-5,), np.deg2rad(0.0087), (0.0,))), "known to 0.0087 deg"),
+        (
+            replace(ACRYLIC, uncertainty=ChamberUncertainty((2e-8,), 0.01, (0.0,))),
+            "panel 1 is described as known to 2e",
+        ),
     ],
 )
 def test_units_that_are_hardly_meant_are_questioned(chamber: Chamber, words: str) -> None:
     assert any(words in finding.text for finding in panel_checks.questions(chamber))
     assert not panel_checks.questions(TRUE)
+    assert not panel_checks.questions(TRUE.with_uncertainty())
+    assert not panel_checks.questions(replace(ACRYLIC, uncertainty=ChamberUncertainty((0.0,), 0.0, (0.0,))))
