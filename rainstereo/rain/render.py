@@ -262,7 +262,8 @@ class Plan:
     def _paste_all(self) -> Paste | PasteLooks:
         if self.renderer.moving:
             return PasteLooks([table for table in self.tables if isinstance(table, Looks)])
-        return Paste([table for table in self.tables if isinstance(table, Lookups)], self.renderer.scene_size)
+        tables = [table for table in self.tables if isinstance(table, Lookups)]
+        return Paste(tables, self.renderer.scene_size, self.renderer.camera.width)
 
     def _in_light(self, image: Image, out: Image) -> None:
         """The same, averaging light; only pixels that drops touch are converted back."""
