@@ -131,7 +131,7 @@ class Piece:
     @property
     def rows(self) -> Indices:
         """Numbers of the rows in the table, in the order in which they are summed."""
-        return self.block.start + self.order
+        return np.asarray(self.order + self.block.start)
 
     def matrix(self, number: Any, kind: type, columns: int) -> Any:
         """As a sparse matrix. number: of each texel among those that are looked at."""

@@ -180,7 +180,7 @@ def _dictionary(level: int) -> _Dictionary:
     away = (every + 0.5) / BINS - 0.5
     of_bins = _covariance(scene, away, inside, texel)
     between = (inside[:, None] - inside).reshape(-1, 2)
-    own = _covariance(scene, np.arange(1 - SIDE, SIDE), between, texel)
+    own = _covariance(scene, np.arange(1.0 - SIDE, SIDE), between, texel)
     place, cell = np.arange(SIDE * BINS), np.arange(SIDE)
     step = place[:, None] - BINS * cell + (SIDE - 1) * BINS  # of a bin and a texel, along an axis
     table = of_bins[step[:, None, :, None], step[None, :, None, :]].reshape(len(place) ** 2, SIDE**2)
@@ -232,11 +232,11 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Array) -> tup
     cost, least = price.astype(np.float32), np.float32(FRESH) * variance
     bases: Image = np.empty((MOST, *along.shape), dtype=np.float32)
     for number in range(MOST):
-        score = rest * rest
+        score: Image = rest * rest
         score /= news
         score /= cost
         best = score.argmax(1)
-        good = score[every, best] > 1
+        good = score[every, best] > (number > 0)  # the first is taken whatever it is worth: sums of weights are kept
         if number == SCREENED and len(variance) > OFFERED:
             keep = np.sort(np.argpartition(score, -OFFERED, axis=1)[:, -OFFERED:], axis=1)
             best = np.take_along_axis(score, keep, 1).argmax(1)
