@@ -87,6 +87,7 @@ class Minifier:
 
     depth: of the scene, metres. tolerance: gray levels RMS. source_size, shift: of the image that holds the scene,
     (width, height), and the place of the camera's image in it. border: "mirror" or "edge".
+    lasting: whether it is worth much time to find few texels.
     """
 
     camera: Camera
@@ -96,6 +97,7 @@ class Minifier:
     source_size: tuple[int, int]
     shift: tuple[int, int] = (0, 0)
     border: str = "mirror"
+    lasting: bool = False
 
     def __post_init__(self) -> None:
         self.clear = _clear_map(self.camera, self.chamber)
@@ -207,7 +209,7 @@ class Minifier:
     def _sums(self) -> Pursuit | Quadtree:
         extent = next(extent for tolerance, extent in EXTENTS if self.tolerance <= tolerance)
         tree = Quadtree(self.source_size, extent, min(WORTH * self.tolerance**2, DEAREST))
-        if not STRICT <= self.tolerance < math.inf:
+        if not self.lasting or not STRICT <= self.tolerance < math.inf:
             return tree
         return Pursuit(self.source_size, min(EACH * self.tolerance**2, DEAREST), tree)
 

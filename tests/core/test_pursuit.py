@@ -7,11 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage import data
 
+from rainstereo import Camera, Chamber, Panel
+from rainstereo.droplet import SphericalCap
+from rainstereo.patch import folded
 from rainstereo.rain import lookups
 from rainstereo.rain.pursuit import MOST, SHRUNK, Pursuit
 from rainstereo.rain.pyramid import copies, copy_starts, half, sizes, starts
 from rainstereo.rain.quadtree import UNIT, Quadtree, Taps, steps_between
+from rainstereo.rain.render import Renderer
 from rainstereo.scene_statistics import SceneStatistics
+from rainstereo.trace import Fate, clear_transmittance, trace
 
 SIZE = (400, 300)
 SIDE = 8
@@ -181,3 +186,54 @@ def test_words_are_clipped_field_by_field():
     shown = np.empty((len(words), 3), dtype=np.uint8)
     lookups._unpack(words, shown)
     np.testing.assert_array_equal(shown, np.clip(values, 0, 255).T)
+
+
+CAMERA = Camera.pinhole(800, 800, 199.5, 149.5, *SIZE)
+PANE = Chamber((0, 0, 1), 0.057, (Panel(0.003, 1.49),))
+DROPS = [
+    SphericalCap((x, y), radius, angle)
+    for x, y, radius, angle in ((-6e-3, -4e-3, 1e-3, 0.35), (5e-3, 3e-3, 1.2e-3, 0.7), (6.5e-3, 3.2e-3, 1e-3, 1.1))
+]
+
+
+def test_plans_that_last_are_within_a_gray_level_of_many_rays():
+    """Some pixels in drops against 24 x 24 exact rays each."""
+    image = photograph().astype(np.uint8)
+    plan, default = (Renderer(CAMERA, PANE, lasting=lasting).plan(DROPS) for lasting in (True, False))
+    found, other = plan.render(image), default.render(image)
+    for name in ("opacity", "displacement", "unknown", "drop_mask"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
+    taps = [sum(len(table.texels) for table in each.tables) for each in (plan, default)]
+    assert taps[0] < 0.8 * taps[1]
+    rows, columns = np.nonzero(found.opacity == 1)
+    some = np.random.default_rng(8).permutation(len(rows))[:400]
+    own = np.stack([columns[some], rows[some]], -1).astype(float)
+    along = (np.arange(24) + 0.5) / 24 - 0.5
+    seen = trace(own[:, None] + np.stack(np.meshgrid(along, along), -1).reshape(-1, 2), DROPS, CAMERA, PANE)
+    lit = seen.status == Fate.THROUGH
+    gain = np.where(lit, seen.transmittance / clear_transmittance(own, CAMERA, PANE)[:, None], 0)
+    at = folded(np.where(lit[..., None], seen.source, 0), SIZE)
+    expected = (cv2.remap(image.astype(np.float32), at, np.zeros(0), cv2.INTER_LINEAR) * gain[..., None]).mean(1)
+    assert (lit.mean(1) > 0).mean() > 0.5
+    assert rms(found.image[rows[some], columns[some]] - np.minimum(expected, 255)) <= 1
+
+
+def test_plans_that_last_do_not_depend_on_the_other_drops():
+    renderer, image = Renderer(CAMERA, PANE, lasting=True), photograph().astype(np.uint8)
+    sequence = renderer.sequence()
+    frames = [each.apply(image) for each in (renderer.plan(DROPS), renderer.plan(DROPS[::-1]), sequence.plan(DROPS))]
+    np.testing.assert_array_equal(frames[0], frames[1])
+    np.testing.assert_array_equal(frames[0], frames[2])
+    np.testing.assert_array_equal(sequence.plan(DROPS[1:]).apply(image), renderer.plan(DROPS[1:]).apply(image))
+    with pytest.raises(ValueError, match="moving and lasting"):
+        Renderer(CAMERA, PANE, moving=True, lasting=True)
+
+
+def test_plans_that_last_for_other_types():
+    """The same in 16 bits, in floating point and in gray."""
+    image = photograph().astype(np.uint8)
+    plan = Renderer(CAMERA, PANE, lasting=True).plan(DROPS)
+    bytes_ = plan.apply(image).astype(float)
+    assert np.abs(plan.apply(image.astype(np.uint16) * 257) / 257 - bytes_).max() <= 1.5
+    assert np.abs(np.clip(plan.apply(image.astype(np.float32) / 255) * 255, 0, 255) - bytes_).max() <= 1.5
+    np.testing.assert_array_equal(plan.apply(np.ascontiguousarray(image[..., 1])), bytes_[..., 1])
