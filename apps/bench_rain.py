@@ -110,13 +110,14 @@ def _dry_work(camera: Camera, pane: Chamber, image: Image, promised: bool) -> Wo
 
 
 def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised: bool) -> Work:
-    default, coarse = Renderer(camera, pane), Renderer(camera, pane, tolerance=COARSE)
+    lasting, default = Renderer(camera, pane, lasting=True), Renderer(camera, pane)
+    coarse = Renderer(camera, pane, tolerance=COARSE)
     variants = [Variant("cv2.remap of the frame", _remap(image, seed), _nothing, note="R")]
     targets = []
     for share, limit in ((0.02, 0.2), (0.1, 0.6), (0.4, 1.2)):
         drops = _rain(camera, pane, share, seed)
         truth: Truth | None = None
-        for renderer, name in ((default, ""), (coarse, ", coarse")):
+        for renderer, name in ((lasting, ""), (default, ", by default"), (coarse, ", coarse")):
             plan = renderer.plan(drops)
             label = f"{100 * share:.0f} %{name}"
             truth = truth or Truth.of(plan, seed, SAMPLED if promised else FEW)
@@ -130,7 +131,7 @@ def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised
     return Work(
         "still",
         "Drops that stand still",
-        "Traced before; the time is that of drawing them into one frame.",
+        "Planned before, with `Renderer(lasting=True)`, by default, and coarsely; the time is that of drawing a frame.",
         tuple(variants),
         "10 %",
         "gray levels",

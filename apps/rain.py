@@ -45,6 +45,8 @@ def run(options: Options) -> int:
     images, videos = [s for s in sources if not s.is_video], [s for s in sources if s.is_video]
     if options.motion is not None and not videos and not options.sequence:
         raise ValueError("--motion is for sequences and videos; add --sequence if the images are frames of one drive")
+    if options.quick and not videos and not options.sequence:
+        raise ValueError("--quick is for drops that move, in sequences and videos; add --sequence, or --tolerance 10")
     pairs = _real_pairs(options)
     rain, drive = settings(options, images), _drive(options, images)
     key = key_of(rain, options.format, options.video_format, options.unknown_labels, options.void_label,

@@ -22,7 +22,7 @@ def key_of(rain: Rain, *others: Any) -> str:
         camera, chamber = rain.seen
         seen = camera.model, camera.intrinsics.tolist(), camera.size, repr(chamber)
     numbers = rain.seed, rain.depth, rain.tolerance, rain.border, rain.linear_light, rain.psnr, rain.psnr_tolerance
-    merge = ("merge",) if rain.merge else ()
+    merge = (*(("merge",) if rain.merge else ()), *(("quick",) if rain.quick else ()))
     made_with = [v for k, v in versions().items() if k in ("rainstereo", "numpy", "scipy", "opencv", "platform")]
     everything = repr((rain.setup, numbers, rain.share, seen, rain.listed, *merge, others, made_with))
     return hashlib.sha256(everything.encode()).hexdigest()[:16]

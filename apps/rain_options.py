@@ -90,6 +90,8 @@ class Options:
     """Take the images, in order of their names, for frames of one drive."""
     motion: MotionKind | None = None
     """Of drops in sequences and videos: physical (default), the paper's rule, or still."""
+    quick: bool = False
+    """For sequences and videos whose sharp drops mostly move: one ray a pixel, off by 4 gray levels or so."""
     refill_s: float = 5.0
     """Seconds in which as many drops fall on a sequence's pane as are there at the start; inf: none fall."""
     fps: float | None = None
@@ -145,7 +147,7 @@ def settings(options: Options, images: list[Source]) -> Rain:
     rain = Rain(
         _setup(options, images), options.seed, options.depth_m, options.tolerance, options.border,
         options.linear_light, options.psnr, options.psnr_tolerance, None, seen,
-        None if options.drops is None else options.drops.read_text(encoding="utf-8"), options.merge,
+        None if options.drops is None else options.drops.read_text(encoding="utf-8"), options.merge, options.quick,
     )  # fmt: skip
     listed = rain.drop_list
     rain.renderer(listed[0].camera.size if listed else seen[0].size if seen else (64, 48))  # says what is wrong

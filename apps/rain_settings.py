@@ -35,6 +35,7 @@ class Rain:
     share: of the heaviest rain's drops, for all images, in place of both; see `over_set`.
     listed: a drop list to be rendered on all images in place of everything else.
     merge: whether drops that touch become one body on images, too.
+    quick: whether sharp drops are traced with one ray a pixel, for a few gray levels.
     """
 
     setup: Setup
@@ -49,6 +50,7 @@ class Rain:
     seen: tuple[Camera, Chamber] | None = None
     listed: str | None = None
     merge: bool = False
+    quick: bool = False
 
     # -- what it is seen through ---------------------------------------------------------------------------------------
 
@@ -87,7 +89,7 @@ class Rain:
         if self.drop_list:
             return self.drop_list[0], pane
         lens, light = self.setup.lens, self.linear_light
-        return Renderer(camera, chamber, self.depth, lens, self.tolerance, self.border, light), pane
+        return Renderer(camera, chamber, self.depth, lens, self.tolerance, self.border, light, self.quick), pane
 
     # -- which drops ---------------------------------------------------------------------------------------------------
 

@@ -1,8 +1,8 @@
 """What the pixels of drops look at: rays, and the texels that stand for them.
 
 A drop shows the scene small: neighbouring pixels may look 50 pixels apart. A pixel's value is the mean over its area,
-taken here from `rays_along` squared rays, each of which stands for its part of the area (`quadtree`). Two rays a side
-tell first which pixels a drop covers, and which of them are dark: most of those need no more.
+taken here from `rays_along` squared rays, each of which stands for its part of the area (`pursuit`, `quadtree`). Two
+rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from rainstereo.trace import BLOCK, clear_transmittance, trace
 from rainstereo.types import Array, Image, Indices, Mask, Status
 
 from .lookups import JOINED, Lookups
+from .pursuit import Pursuit
 from .quadtree import Quadtree
 from .samples import Samples
 
@@ -38,7 +39,11 @@ EXTENTS = ((0.75, 33), (2.5, 17), (6.0, 9), (60.0, 5), (math.inf, 3))
 WORTH = 0.003
 """Of a texel that is saved, in square gray levels, at a tolerance of 1 gray level; as its square. With this, drops are
 within the tolerance of 64 rays a pixel, which are themselves wrong by 0.6 to 0.8 gray levels, and of 576."""
+EACH = 0.04
+"""The same of a texel more in `Pursuit`."""
 DEAREST = 4.0
+STRICT = 0.9
+"""Gray levels: for tolerances below, there is only the tree, whose windows are finer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +87,7 @@ class Minifier:
 
     depth: of the scene, metres. tolerance: gray levels RMS. source_size, shift: of the image that holds the scene,
     (width, height), and the place of the camera's image in it. border: "mirror" or "edge".
+    lasting: whether it is worth much time to find few texels.
     """
 
     camera: Camera
@@ -91,6 +97,7 @@ class Minifier:
     source_size: tuple[int, int]
     shift: tuple[int, int] = (0, 0)
     border: str = "mirror"
+    lasting: bool = False
 
     def __post_init__(self) -> None:
         self.clear = _clear_map(self.camera, self.chamber)
@@ -195,13 +202,16 @@ class Minifier:
             last = self.source_size[axis] - 1
             unknown |= (((at < 0) | (at > last)) & lit).any(0)
             places.append(folded_along(at, last, self.border))
-        taps = self._quadtree.taps(places[0], places[1], samples.gain * np.float32(1 / rays))
+        taps = self._sums.taps(places[0], places[1], samples.gain * np.float32(1 / rays))
         return Lookups.of(pixels, batch.groups[rows], taps, 1 - covered / rays, np.stack(displacement, -1), unknown)
 
     @cached_property
-    def _quadtree(self) -> Quadtree:
+    def _sums(self) -> Pursuit | Quadtree:
         extent = next(extent for tolerance, extent in EXTENTS if self.tolerance <= tolerance)
-        return Quadtree(self.source_size, extent, min(WORTH * self.tolerance**2, DEAREST))
+        tree = Quadtree(self.source_size, extent, min(WORTH * self.tolerance**2, DEAREST))
+        if not self.lasting or not STRICT <= self.tolerance < math.inf:
+            return tree
+        return Pursuit(self.source_size, min(EACH * self.tolerance**2, DEAREST), tree)
 
 
 def _labelled(drops: Sequence[Drop], which: Indices, pixels: Array) -> tuple[Sequence[Drop], Indices, Array]:

@@ -6,6 +6,7 @@ width or height is odd, its last column or row counts twice.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 
 import cv2
@@ -16,6 +17,7 @@ from rainstereo.types import Array, Image
 
 SMALLEST = 4  # pixels along the shorter side
 BIAS = 0.125  # gray levels by which OpenCV's mean of four bytes is too large: it rounds halves up
+BIAS_OF_PAIRS = 0.25  # the same of means of two bytes, halves rounded up
 SHARP = 2  # level up to which a sharp image is as uneven as there
 ACROSS = 4  # points along a texel's side that stand for its area
 
@@ -33,6 +35,34 @@ def starts(size: tuple[int, int]) -> list[int]:
     found = [0]
     for width, height in sizes(size):
         found.append(found[-1] + width * height)
+    return found
+
+
+@dataclass(frozen=True)
+class Copy:
+    """An image averaged over 2^across x 2^down pixels."""
+
+    across: int
+    down: int
+    width: int
+    height: int
+
+
+def copies(size: tuple[int, int]) -> list[Copy]:
+    """The levels; then, from each but the last, the means of its pairs of columns; then of its pairs of rows."""
+    levels = list(enumerate(sizes(size)))
+    return [
+        *(Copy(k, k, w, h) for k, (w, h) in levels),
+        *(Copy(k + 1, k, -(-w // 2), h) for k, (w, h) in levels[:-1]),
+        *(Copy(k, k + 1, w, -(-h // 2)) for k, (w, h) in levels[:-1]),
+    ]
+
+
+def copy_starts(size: tuple[int, int]) -> list[int]:
+    """Number of the first texel of each copy, and of all; levels as in `starts`."""
+    found = [0]
+    for copy in copies(size):
+        found.append(found[-1] + copy.width * copy.height)
     return found
 
 

@@ -39,7 +39,7 @@ CELLS = 1 << 18  # of windows that are held at once
 
 @dataclass(frozen=True, eq=False)
 class Taps:
-    """Texels of pixels, by rows. texels, weights: (T,) int32, uint16 in `UNIT`ths. counts: (M,) of each pixel.
+    """Texels of pixels, by rows. texels, weights: (T,) int32, int16 in `UNIT`ths. counts: (M,) of each pixel.
 
     error: (M,) expected square of what merging changed, gray levels.
     """
@@ -70,18 +70,18 @@ class Quadtree:
 
     def _some(self, x: Array, y: Array, weights: Array, side: int) -> Taps:
         steps = steps_between(x, y, weights)
-        span = _span(x, y, weights)
-        loose = self._is_loose(span, steps, weights)
+        span = span_of(x, y, weights)
+        loose = self.is_loose(span, steps, weights)
         if loose.any():
             tight = np.flatnonzero(~loose)
             rays = [columns[:, tight] for columns in (x, y, weights)]
-            one = self._together(rays[0], rays[1], rays[2], _of(steps, tight), span[tight], side)
+            one = self._together(rays[0], rays[1], rays[2], of_some(steps, tight), span[tight], side)
             apart = np.flatnonzero(loose)
             rays = [columns[:, apart] for columns in (x, y, weights)]
-            return _mixed(loose, one, self._apart(rays[0], rays[1], rays[2], _of(steps, apart)))
+            return mixed(loose, one, self._apart(rays[0], rays[1], rays[2], of_some(steps, apart)))
         return self._together(x, y, weights, steps, span, side)
 
-    def _is_loose(self, span: Array, steps: Steps, weights: Array) -> Mask:
+    def is_loose(self, span: Array, steps: Steps, weights: Array) -> Mask:
         """Which pixels see several places far apart, (M,): a window for all of them would be too coarse."""
         along = math.isqrt(len(weights))
         length = np.maximum(np.abs(steps[0]) + np.abs(steps[2]), np.abs(steps[1]) + np.abs(steps[3]))
@@ -104,7 +104,7 @@ class Quadtree:
             for at, last in ((x, wide), (y, high))
         )
         texel = np.array(starts(self.size))[level] + i * wide[level] + j
-        return _whole(pixel, texel, weights[ray, pixel], count, np.zeros(count))
+        return whole(pixel, texel, weights[ray, pixel], count, np.zeros(count))
 
     def _together(self, x: Array, y: Array, weights: Array, steps: Steps, span: Array, side: int) -> Taps:
         count = weights.shape[1]
@@ -138,7 +138,7 @@ class Quadtree:
         pixel, of_level, i, j, weight = (np.concatenate(parts)[order] for parts in zip(*found, strict=True))
         wide = np.array([size[0] for size in sizes(self.size)])
         texel = np.array(starts(self.size))[of_level] + i * wide[of_level] + j
-        return _whole(pixel, texel, weight, count, error)
+        return whole(pixel, texel, weight, count, error)
 
     def _place(
         self, cell: Indices, merge: int, side: int, level: Indices, column: Indices, row: Indices
@@ -154,7 +154,7 @@ class Quadtree:
 
     def _window(self, x: Array, y: Array, weights: Array, span: Array) -> tuple[Indices, Indices, Indices]:
         """Of each pixel the level, and the first column and row of a window of it that holds the rays."""
-        low = [_ends(at, weights)[0] for at in (x, y)]
+        low = [ends_of(at, weights)[0] for at in (x, y)]
         level = np.ceil(np.log2(np.maximum(span / (self.extent - 1), 1e-6)) - 1e-6)
         level = np.clip(level, 0, len(sizes(self.size)) - 1).astype(np.intp)
         scale = np.exp2(-level.astype(np.float32))
@@ -250,7 +250,7 @@ def _counted(cells: Indices, shares: Array, side: int, count: int) -> Array:
     return found
 
 
-def _ends(at: Array, weights: Array) -> tuple[Array, Array]:
+def ends_of(at: Array, weights: Array) -> tuple[Array, Array]:
     """The least and the largest of the lit rays' coordinates, (M,); 0 where none is lit."""
     away = np.where(weights > 0, np.float32(0), np.float32(np.inf))
     low, high = (at + away).min(0), (at - away).max(0)
@@ -259,19 +259,19 @@ def _ends(at: Array, weights: Array) -> tuple[Array, Array]:
     return low, high
 
 
-def _span(x: Array, y: Array, weights: Array) -> Array:
+def span_of(x: Array, y: Array, weights: Array) -> Array:
     """Sides, (M,) pixels, of the squares that hold the lit rays."""
-    (left, right), (top, bottom) = (_ends(at, weights) for at in (x, y))
+    (left, right), (top, bottom) = (ends_of(at, weights) for at in (x, y))
     return np.maximum(right - left, bottom - top)
 
 
-def _of(steps: Steps, some: Indices) -> Steps:
+def of_some(steps: Steps, some: Indices) -> Steps:
     """Steps of some pixels."""
     a, b, c, d = (step[:, some] for step in steps)
     return a, b, c, d
 
 
-def _mixed(second: Mask, one: Taps, other: Taps) -> Taps:
+def mixed(second: Mask, one: Taps, other: Taps) -> Taps:
     """Taps of all pixels: the others are those of `second`."""
     counts: Indices = np.empty(len(second), dtype=np.intp)
     error: Array = np.empty(len(second))
@@ -313,7 +313,7 @@ def steps_between(x: Array, y: Array, weights: Array) -> Steps:
     return found[0], found[1], found[2], found[3]
 
 
-def _whole(pixel: Indices, texel: Indices, weight: Array, count: int, error: Array) -> Taps:
+def whole(pixel: Indices, texel: Indices, weight: Array, count: int, error: Array) -> Taps:
     """Weights rounded so that each pixel's sum is, in `UNIT`ths, as near as it can be; those of 0 are left out.
 
     What one tap is rounded by is made good by the next: sums so far are rounded, in whole numbers, exactly.
@@ -326,7 +326,7 @@ def _whole(pixel: Indices, texel: Indices, weight: Array, count: int, error: Arr
     steps = np.diff(rounded, prepend=0)
     first = np.flatnonzero(np.diff(pixel, prepend=-1))
     steps[first] = rounded[first]
-    keep = steps > 0
+    keep = steps != 0
     return Taps(
-        texel[keep].astype(np.int32), steps[keep].astype(np.uint16), np.bincount(pixel[keep], minlength=count), error
+        texel[keep].astype(np.int32), steps[keep].astype(np.int16), np.bincount(pixel[keep], minlength=count), error
     )

@@ -353,6 +353,18 @@ def test_drops_stay_or_move_over_a_sequence(clear: Path, tmp_path: Path, motion:
     assert {"001.png", "004.png"} <= contents(tmp_path / "part").keys()
 
 
+def test_quick_frames_of_a_sequence_are_nearly_the_same(clear: Path, tmp_path: Path) -> None:
+    options = (*FEW, "--sequence", "--motion", "paper", "--fps", "10", "--f-number", "inf")
+    for name, more in (("careful", ()), ("quick", ("--quick",))):
+        assert rain(clear, tmp_path / name, *options, *more) == 0
+    frames = [imagefile.read(tmp_path / name / "003.png").astype(float) for name in ("careful", "quick")]
+    assert 0 < np.sqrt(np.mean((frames[0] - frames[1]) ** 2)) < 8
+    renderer, drops = Renderer.from_json((tmp_path / "quick/drops/003.json").read_text())
+    assert renderer.moving
+    np.testing.assert_array_equal(renderer.plan(drops).apply(imagefile.read(clear / "003.png")), frames[1])
+    assert rain(clear, tmp_path / "careful", *options, "--quick") == 2  # another kind of rain's folder
+
+
 def test_rain_that_goes_on_wets_the_pane_again() -> None:
     counts = {}
     for refill in (0.5, math.inf):
@@ -470,6 +482,7 @@ def test_a_rig_fixes_camera_pane_and_size(recording: Path, clear: Path, tmp_path
         (("--workers", "-1"), "expected 0 (one a processor)"),
         (("--seed", "-1"), "expected a whole number"),
         (("--motion", "paper"), "add --sequence"),
+        (("--quick",), "add --sequence"),
         (("--distance-mm", "-5"), "first face"),
         (("--f-number", "0"), "F-number"),
         (("--focus-m", "0.001"), "focus distance"),

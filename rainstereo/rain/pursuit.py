@@ -1,0 +1,282 @@
+"""The few texels, of many sizes and shapes, that tell best what a pixel shows which looks at the scene along many rays.
+
+A pixel is a weighted sum of values of the scene, w. So is a sum of texels with weights v, whatever texels are taken;
+of a scene of known statistics (`SceneStatistics.natural`) the expected square of the difference of both is a quadratic
+form in w and v. Texels are taken one after the other, each time the one that lowers it most, all weights being anew the
+best ones, as long as it falls by `worth` for each: orthogonal least squares (S. Chen, S. A. Billings and W. Luo,
+"Orthogonal least squares methods and their application to non-linear system identification", Int. J. Control 50, 1989),
+with a field's covariance for the inner product. Weights can be negative: a large texel less what it has too much.
+
+The texels offered are those of a window of `SIDE` x `SIDE` in the finest level in which it holds all of the pixel's
+rays, and the coarser ones there, of which some are twice as wide as high or the reverse (`pyramid.copies`). What they
+have in common with one another depends on the level alone, and is tabulated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from rainstereo.scene_statistics import SceneStatistics
+from rainstereo.types import Array, Image, Indices, Mask
+
+from .pyramid import Copy, copies, copy_starts, sizes
+from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, steps_between, whole
+
+SHAPES = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 1), (1, 2), (2, 2))
+"""Of texels offered: halvings across and down, from the window's."""
+SIDE = 20  # texels along a window
+BINS = 2  # places along one of them to which rays are rounded
+ALIGNED = 4
+ROOM = SIDE - ALIGNED + 1  # texels that rays may span, wherever they are
+POINTS = 4  # along a texel's side that stand for its area
+MOST = 40  # texels of a pixel
+SMALL = 9.0
+"""Pixels that rays must span: up to there their own four texels each are few enough, and exact."""
+SHRUNK = 4
+"""Times that the photographs are shrunk whose statistics are taken: sharp images have more of what is fine."""
+NEGATIVE = 0.45
+"""What weights below 0 may add up to: sums of bytes have room for it, and a spot of light leaves no dark rings."""
+FRESH = 1e-4  # part of a texel's variance that must be news after those taken before
+SCREENED, OFFERED = 8, 256
+"""After so many texels of a pixel only so many others, those worth most then, are offered to it."""
+ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
+TOGETHER = 128  # pixels: few enough for the caches
+QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+FINEST, DEAR = 2, 1.0
+"""Levels below this have so many texels that making them ready for sums costs, too; what one of these counts for."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Chosen:
+    """Texels of M pixels: texel, weight (M, MOST), counts (M,) of those before others of weight 0."""
+
+    texel: Indices
+    weight: Array
+    counts: Indices
+
+
+@dataclass(frozen=True)
+class Pursuit:
+    """size: (width, height) of the image. worth: square gray levels that a texel must be worth. tree: for pixels that
+    windows do not suit."""
+
+    size: tuple[int, int]
+    worth: float
+    tree: Quadtree
+
+    def level(self, span: Array) -> Indices:
+        """Of pixels whose rays span squares of such sides, (M,) pixels, the level of the window; -1: none suits."""
+        level = np.maximum(np.ceil(np.log2(np.maximum(span / ROOM, 1e-6)) - 1e-6), 0).astype(np.intp)
+        return np.where((span < SMALL) | (level >= len(sizes(self.size))), -1, level)
+
+    def taps(self, x: Array, y: Array, weights: Array) -> Taps:
+        """Texels of M pixels for rays at x, y, (K, M) float32 each, in the image, K a square, of weights (K, M).
+
+        Pixels that see several places far apart, or that would need weights far below 0, get those of the tree.
+        """
+        steps, span = steps_between(x, y, weights), span_of(x, y, weights)
+        able = np.flatnonzero((self.level(span) >= 0) & ~self.tree.is_loose(span, steps, weights))
+        low = np.stack([ends_of(at, weights)[0] for at in (x, y)])[:, able]
+        rays = [columns[:, able] for columns in (x, y, weights)]
+        chosen = self._choose(rays[0], rays[1], rays[2], of_some(steps, able), low, span[able])
+        good = np.minimum(chosen.weight, 0).sum(1) >= -NEGATIVE
+        able = able[good]
+        rest = np.ones(len(span), dtype=np.bool_)
+        rest[able] = False
+        tree = self.tree.taps(x[:, rest], y[:, rest], weights[:, rest])
+        counts = chosen.counts[good]
+        there = np.arange(MOST) < counts[:, None]
+        pixel = np.repeat(np.arange(len(able)), counts)
+        taps = whole(pixel, chosen.texel[good][there], chosen.weight[good][there], len(able), np.zeros(len(able)))
+        return mixed(~rest, tree, taps)
+
+    def _choose(self, x: Array, y: Array, weights: Array, steps: Steps, low: Array, span: Array) -> _Chosen:
+        """Texels for rays at x, y (K, M). low: (2, M) least x and y, span: (M,)."""
+        count = weights.shape[1]
+        level = self.level(span)
+        texel: Indices = np.zeros((count, MOST), dtype=np.intp)
+        weight: Array = np.zeros((count, MOST))
+        counts: Indices = np.zeros(count, dtype=np.intp)
+        for each in np.unique(level).tolist():
+            some = np.flatnonzero(level == each)
+            for first in range(0, len(some), TOGETHER):
+                part = some[first : first + TOGETHER]
+                rays = (x[:, part], y[:, part], weights[:, part], of_some(steps, part))
+                found = self._of_level(each, *rays, low[:, part])
+                texel[part], weight[part], counts[part] = found.texel, found.weight, found.counts
+        return _Chosen(texel, weight, counts)
+
+    def _of_level(self, level: int, x: Array, y: Array, weights: Array, steps: Steps, low: Array) -> _Chosen:
+        words, scale, count = _dictionary(level), 0.5**level, weights.shape[1]
+        places = SIDE * BINS
+        first = np.floor((low + 0.5) * scale).astype(np.intp) & -ALIGNED  # column and row of the window
+        bins: Indices = np.empty((len(QUARTERS), *weights.shape), dtype=np.intp)
+        fine = np.float32(scale * BINS)
+        for part, (a, b) in enumerate(QUARTERS):
+            j, i = (
+                (at + np.float32(a) * across + np.float32(b) * along + np.float32(0.5)) * fine - start
+                for at, across, along, start in zip((x, y), steps[:2], steps[2:], first * BINS, strict=True)
+            )
+            j, i = (np.clip(at, 0, places - 1).astype(np.intp) for at in (j, i))
+            bins[part] = i * places + j
+        rays = bins[0].size // count * len(QUARTERS)
+        where = np.moveaxis(bins, -1, 0).reshape(count, rays)
+        share = np.tile(np.float32(0.25) * weights.T, len(QUARTERS))
+        ends = np.arange(0, (count + 1) * rays, rays)
+        common = csr_array((share.ravel(), where.ravel(), ends), shape=(count, places**2)) @ words.of_bins
+        offered, numbers = self._offered(level, first)
+        along = _sums(common.reshape(count, SIDE, SIDE))
+        taken, counts = _taken(words, along, offered, self._prices(level))
+        weight = _weights(words, along, taken, counts, weights.sum(0, dtype=np.float64))
+        texel = np.take_along_axis(numbers, taken, 1)
+        return _Chosen(texel, weight, counts)
+
+    def _prices(self, level: int) -> Array:
+        """What each texel of a window must be worth, (A,)."""
+        price = []
+        for across, down in SHAPES:
+            fine = level + min(across, down) < FINEST
+            price.append(self.worth * (1.0 if not fine else DEAR if across == down else np.inf))
+        return np.repeat(price, [(SIDE >> shape[0]) * (SIDE >> shape[1]) for shape in SHAPES])
+
+    def _offered(self, level: int, first: Indices) -> tuple[Mask, Indices]:
+        """Which texels of windows the image has, and their numbers, (M, A)."""
+        column, row = first
+        offered, numbers = [], []
+        at = {(copy.across, copy.down): (copy, start) for copy, start in self._copies}
+        for across, down in SHAPES:
+            copy, start = at.get((level + across, level + down), (Copy(0, 0, 0, 0), 0))
+            j = (column >> across)[:, None, None] + np.arange(SIDE >> across)
+            i = (row >> down)[:, None, None] + np.arange(SIDE >> down)[:, None]
+            offered.append(((j < copy.width) & (i < copy.height)).reshape(len(column), -1))
+            numbers.append((start + i * copy.width + j).reshape(len(column), -1))
+        return np.concatenate(offered, 1), np.concatenate(numbers, 1)
+
+    @cached_property
+    def _copies(self) -> list[tuple[Copy, int]]:
+        return list(zip(copies(self.size), copy_starts(self.size), strict=False))
+
+
+@dataclass(frozen=True, eq=False)
+class _Dictionary:
+    """What texels of a window have in common. of_bins: (bins, side^2) of places with the window's own texels. gram: (A,
+    A) of texels with one another. Square gray levels."""
+
+    of_bins: Array
+    gram: Array
+
+
+@cache
+def _dictionary(level: int) -> _Dictionary:
+    scene, texel = _scene(level), 2.0**level
+    points = min(POINTS, 2**level)
+    inside = (np.arange(points) + 0.5) / points - 0.5
+    inside = np.stack(np.meshgrid(inside, inside), -1).reshape(-1, 2)
+    every = np.arange(-(SIDE - 1) * BINS, SIDE * BINS)
+    away = (every + 0.5) / BINS - 0.5
+    of_bins = _covariance(scene, away, inside, texel)
+    between = (inside[:, None] - inside).reshape(-1, 2)
+    own = _covariance(scene, np.arange(1.0 - SIDE, SIDE), between, texel)
+    place, cell = np.arange(SIDE * BINS), np.arange(SIDE)
+    step = place[:, None] - BINS * cell + (SIDE - 1) * BINS  # of a bin and a texel, along an axis
+    table = of_bins[step[:, None, :, None], step[None, :, None, :]].reshape(len(place) ** 2, SIDE**2)
+    lag = cell[:, None] - cell + SIDE - 1
+    base = own[lag[:, None, :, None], lag[None, :, None, :]].reshape(SIDE**2, SIDE**2)
+    whole = _sums(base.reshape(-1, SIDE, SIDE))
+    gram = _sums(np.ascontiguousarray(whole.T).reshape(-1, SIDE, SIDE))
+    return _Dictionary(table.astype(np.float32), gram.astype(np.float32))
+
+
+def _scene(level: int) -> SceneStatistics:
+    """Of photographs shrunk `SHRUNK` times: sharp ones."""
+    scene = SceneStatistics.natural()
+    return SceneStatistics(scene.mean, scene.lags / SHRUNK, scene.covariance)
+
+
+def _covariance(scene: SceneStatistics, away: Array, parts: Array, texel: float) -> Array:
+    """E[I(p) I(q)] for lags in texels, y and x from `away`, the mean over `parts`."""
+    x, y = np.meshgrid(away, away)
+    total = np.zeros(x.shape)
+    for dx, dy in parts:
+        total += scene.at(texel * np.hypot(x - dx, y - dy))
+    return np.asarray(total / len(parts) + scene.mean**2)
+
+
+def _sums(values: Array) -> Array:
+    """Of what a window's texels have in common with pixels, (M, side, side), that of all texels offered, (M, A)."""
+    found = {(0, 0): values}
+    for across, down in SHAPES[1:]:
+        if (across - 1, down) in found:
+            finer = found[across - 1, down]
+            found[across, down] = 0.5 * (finer[:, :, ::2] + finer[:, :, 1::2])
+        else:
+            finer = found[across, down - 1]
+            found[across, down] = 0.5 * (finer[:, ::2] + finer[:, 1::2])
+    return np.concatenate([found[shape].reshape(len(values), -1) for shape in SHAPES], 1)
+
+
+def _taken(words: _Dictionary, along: Array, offered: Mask, price: Array) -> tuple[Indices, Indices]:
+    """Numbers of texels taken, (M, MOST), and how many, (M,). along: (M, A) covariances with the pixels."""
+    count, variance = len(along), np.diag(words.gram)
+    gram = words.gram
+    taken: Indices = np.zeros((count, MOST), dtype=np.intp)
+    counts: Indices = np.zeros(count, dtype=np.intp)
+    rows, every = np.arange(count), np.arange(count)
+    columns: Indices = np.broadcast_to(np.arange(len(variance)), along.shape)
+    rest: Image = along.astype(np.float32)
+    news: Image = np.where(offered, variance, np.float32(np.inf))
+    cost, least = price.astype(np.float32), np.float32(FRESH) * variance
+    bases: Image = np.empty((MOST, *along.shape), dtype=np.float32)
+    for number in range(MOST):
+        score: Image = rest * rest
+        score /= news
+        score /= cost
+        best = score.argmax(1)
+        good = score[every, best] > (number > 0)  # the first is taken whatever it is worth: sums of weights are kept
+        if number == SCREENED and len(variance) > OFFERED:
+            keep = np.sort(np.argpartition(score, -OFFERED, axis=1)[:, -OFFERED:], axis=1)
+            best = np.take_along_axis(score, keep, 1).argmax(1)
+            columns, rest, news = (np.take_along_axis(each, keep, 1) for each in (columns, rest, news))
+            cost, least = cost[columns], least[columns]
+            fewer: Image = np.empty((MOST, *rest.shape), dtype=np.float32)
+            for old, new in zip(bases[:number], fewer, strict=False):
+                new[...] = np.take_along_axis(old, keep, 1)
+            bases = fewer
+        if np.count_nonzero(good) < ACTIVE * len(rows):
+            if not good.any():
+                break
+            rows, best, rest, news, columns = (each[good] for each in (rows, best, rest, news, columns))
+            cost, least = (each[good] if each.ndim == 2 else each for each in (cost, least))
+            bases = np.concatenate([bases[:number, good], np.empty((MOST - number, *rest.shape), np.float32)])
+            every, good = np.arange(len(rows)), good[good]
+        chosen = columns[every, best]
+        taken[rows[good], number] = chosen[good]
+        counts[rows[good]] += 1
+        base = gram[chosen] if cost.ndim == 1 else gram[chosen[:, None], columns]
+        for before in bases[:number]:
+            base -= before[every, best][:, None] * before
+        base *= (1 / np.sqrt(news[every, best]))[:, None]
+        rest -= (rest[every, best] / np.sqrt(news[every, best]))[:, None] * base
+        bases[number] = base
+        base *= base
+        news -= base
+        news[news <= least] = np.inf
+        rest[~good] = 0
+    return taken, counts
+
+
+def _weights(words: _Dictionary, along: Array, taken: Indices, counts: Indices, total: Array) -> Array:
+    """The best weights, (M, MOST), of those that add up to `total`, (M,)."""
+    found: Array = np.zeros(taken.shape)
+    for count in np.unique(counts[counts > 0]).tolist():
+        rows = np.flatnonzero(counts == count)
+        some = taken[rows, :count]
+        gram = words.gram[some[:, :, None], some[:, None]].astype(np.float64)
+        given = np.stack([np.take_along_axis(along[rows], some, 1), np.ones(some.shape)], -1)
+        free, even = np.moveaxis(np.linalg.solve(gram, given), -1, 0)
+        found[rows, :count] = free + even * ((total[rows] - free.sum(1)) / even.sum(1))[:, None]
+    return found

@@ -1,0 +1,239 @@
+"""Few texels for a pixel's rays: against the rays, the tree, and the best weights found from points."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage import data
+
+from rainstereo import Camera, Chamber, Panel
+from rainstereo.droplet import SphericalCap
+from rainstereo.patch import folded
+from rainstereo.rain import lookups
+from rainstereo.rain.pursuit import MOST, SHRUNK, Pursuit
+from rainstereo.rain.pyramid import copies, copy_starts, half, sizes, starts
+from rainstereo.rain.quadtree import UNIT, Quadtree, Taps, steps_between
+from rainstereo.rain.render import Renderer
+from rainstereo.scene_statistics import SceneStatistics
+from rainstereo.trace import Fate, clear_transmittance, trace
+
+SIZE = (400, 300)
+SIDE = 8
+WORTH = 0.04
+
+
+def photograph() -> np.ndarray:
+    return np.asarray(cv2.resize(data.astronaut(), SIZE, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def texels(image: np.ndarray) -> np.ndarray:
+    """Values, (N, 3), of all copies, one after the other."""
+    levels = [image]
+    for _ in sizes(SIZE)[1:]:
+        levels.append(half(levels[-1]))
+    padded = [np.pad(level, ((0, 1), (0, 1), (0, 0)), "edge") for level in levels[:-1]]
+    even = [(level.shape[0] // 2 * 2, level.shape[1] // 2 * 2) for level in padded]
+    wide = [(p[:-1, :w:2] + p[:-1, 1:w:2]) / 2 for p, (_, w) in zip(padded, even, strict=True)]
+    tall = [(p[:h:2, :-1] + p[1:h:2, :-1]) / 2 for p, (h, _) in zip(padded, even, strict=True)]
+    return np.concatenate([part.reshape(-1, 3) for part in (*levels, *wide, *tall)])
+
+
+def summed(taps: Taps, image: np.ndarray) -> np.ndarray:
+    values = taps.weights[:, None] / UNIT * texels(image)[taps.texels]
+    total = np.zeros((len(taps.counts), 3))
+    np.add.at(total, np.repeat(np.arange(len(taps.counts)), taps.counts), values)
+    return total
+
+
+def pixels(seed: int, count: int, widest: float, side: int = SIDE) -> tuple[np.ndarray, np.ndarray]:
+    """x and y, (side^2, M), of rays evenly over parallelograms."""
+    rng = np.random.default_rng(seed)
+    centre, right, down = rng.uniform([60, 60], [340, 240], (count, 2)), *rng.uniform(-widest, widest, (2, count, 2))
+    along = (np.arange(side) + 0.5) / side - 0.5
+    a, b = (n.reshape(-1, 1, 1) for n in np.meshgrid(along, along))
+    at = np.clip(centre + a * right + b * down, 0, np.array(SIZE) - 1).astype(np.float32)
+    return np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
+
+
+def even(x: np.ndarray) -> np.ndarray:
+    return np.full(x.shape, 1 / len(x), dtype=np.float32)
+
+
+def pursuit(worth: float = WORTH) -> Pursuit:
+    return Pursuit(SIZE, worth, Quadtree(SIZE, 17, 0.003))
+
+
+def rms(difference: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(difference))))
+
+
+def test_fewer_texels_than_the_tree_for_less_error():
+    """The reference: rays four times as dense along each side."""
+    image = photograph()
+    x, y = pixels(1, 300, 60)
+    truth = cv2.remap(image, *pixels(1, 300, 60, 4 * SIDE), cv2.INTER_LINEAR).mean(0)
+    ours, tree = pursuit().taps(x, y, even(x)), pursuit().tree.taps(x, y, even(x))
+    assert rms(summed(ours, image) - truth) < rms(summed(tree, image) - truth) < 3
+    assert len(ours.texels) < 0.6 * len(tree.texels)
+
+
+def test_worth_trades_texels_for_error():
+    image, (x, y) = photograph(), pixels(2, 200, 60)
+    truth = cv2.remap(image, x, y, cv2.INTER_LINEAR).mean(0)
+    found = [pursuit(worth).taps(x, y, even(x)) for worth in (0.01, 0.3, 4.0)]
+    counts = [len(taps.texels) for taps in found]
+    errors = [rms(summed(taps, image) - truth) for taps in found]
+    assert counts == sorted(counts, reverse=True)
+    assert errors == sorted(errors)
+    assert counts[0] > 3 * counts[-1]
+
+
+def test_weights_are_the_best_ones():
+    """For the texels chosen, against weights from the covariances of points, solved one pixel at a time."""
+    scene = SceneStatistics.natural()
+    scene = SceneStatistics(scene.mean, scene.lags / SHRUNK, scene.covariance)
+    x, y = pixels(3, 12, 50)
+    taps = pursuit().taps(x, y, even(x))
+    steps = steps_between(x, y, even(x))
+    firsts, shapes = np.array(copy_starts(SIZE)), copies(SIZE)
+    inside = np.stack(np.meshgrid(*2 * [(np.arange(8) + 0.5) / 8]), -1).reshape(-1, 2)
+    last = 0
+    for pixel, count in enumerate(taps.counts):
+        some = slice(last, last + count)
+        last += count
+        which = np.searchsorted(firsts, taps.texels[some], "right") - 1
+        points = []
+        for texel, number in zip(taps.texels[some], which, strict=True):
+            copy = shapes[number]
+            corner = np.array(divmod(texel - firsts[number], copy.width))[::-1]
+            points.append((corner + inside) * [2**copy.across, 2**copy.down] - 0.5)
+        own, across, along = (np.stack(part, -1)[:, pixel] for part in ((x, y), steps[:2], steps[2:]))
+        rays = np.concatenate([own + a * across + b * along for a in (-0.25, 0.25) for b in (-0.25, 0.25)])
+        every = np.concatenate([*points, rays])
+        away = np.hypot(*np.moveaxis(every[:, None] - every, -1, 0))
+        groups = np.repeat(np.arange(count + 1), [len(p) for p in (*points, rays)])
+        mean = (groups == np.arange(count + 1)[:, None]) / np.bincount(groups)[:, None]
+        covariance = mean @ (scene.at(away) + scene.mean**2) @ mean.T
+        best = np.linalg.solve(covariance[:-1, :-1], covariance[:-1, -1])
+
+        def square(weights: np.ndarray, covariance: np.ndarray = covariance) -> float:
+            of_all = np.append(weights, -1)
+            return float(of_all @ covariance @ of_all)
+
+        ours = square(taps.weights[some] / UNIT)
+        assert ours <= 1.15 * square(best) + 0.02  # places rounded to half a texel, weights to 1/4096
+        assert ours < 0.9 * square(np.full(count, 1 / count))
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    st.integers(0, 10**6), st.integers(1, 20), st.floats(0.1, 200), st.floats(0.05, 1.1), st.sampled_from([0.04, 4.0])
+)
+def test_any_rays(seed, count, widest, gain, worth):
+    """Weights add up to the rays'; there is room for those below 0; a pixel's texels do not depend on the others'."""
+    x, y = pixels(seed, count, widest)
+    rng = np.random.default_rng(seed)
+    weights = (rng.uniform(0, gain, x.shape) * (rng.random(x.shape) < 0.7) / SIDE**2).astype(np.float32)
+    taps = pursuit(worth).taps(x, y, weights)
+    assert taps.texels.min(initial=0) >= 0
+    assert taps.texels.max(initial=0) < copy_starts(SIZE)[-1]
+    pixel = np.repeat(np.arange(count), taps.counts)
+    np.testing.assert_allclose(np.bincount(pixel, taps.weights / UNIT, count), weights.sum(0), atol=1 / UNIT)
+    assert np.bincount(pixel, np.minimum(taps.weights / UNIT, 0), count).min() > -0.46
+    alone = pursuit(worth).taps(x[:, -1:], y[:, -1:], weights[:, -1:])
+    np.testing.assert_array_equal(taps.texels[len(taps.texels) - alone.counts[0] :], alone.texels)
+    np.testing.assert_array_equal(taps.weights[len(taps.texels) - alone.counts[0] :], alone.weights)
+
+
+def test_nothing_to_see():
+    none = np.zeros((SIDE**2, 0), dtype=np.float32)
+    assert pursuit().taps(none, none, none).counts.size == 0
+    dark = np.zeros((SIDE**2, 3), dtype=np.float32)
+    assert pursuit().taps(dark, dark, dark).counts.tolist() == [0, 0, 0]
+    x, y = pixels(4, 5, 100)
+    assert pursuit(1e-9).taps(x, y, even(x)).counts.max() <= MOST
+
+
+def test_copies_follow_the_levels():
+    assert copy_starts(SIZE)[: len(starts(SIZE))] == starts(SIZE)
+    wide, tall = (next(c for c in copies((101, 61)) if (c.across, c.down) == shape) for shape in ((2, 1), (1, 2)))
+    assert (wide.width, wide.height, tall.width, tall.height) == (26, 31, 51, 16)
+    assert texels(photograph()).shape == (copy_starts(SIZE)[-1], 3)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3])
+def test_words_of_bytes(channels):
+    """Packing, means and clipping of three bytes in a word, for every value of a field."""
+    rng = np.random.default_rng(5)
+    one, other = rng.integers(0, 256, (2, 999, channels), dtype=np.uint8)
+    shown = np.empty_like(one)
+    words = lookups._packed(one)
+    lookups._unpack(words.copy(), shown)
+    np.testing.assert_array_equal(shown, one)
+    lookups._unpack(lookups._means_of_words(words, lookups._packed(other)), shown)
+    np.testing.assert_array_equal(shown, (one.astype(int) + other + 1) // 2)
+
+
+def test_words_are_clipped_field_by_field():
+    values = np.random.default_rng(6).permuted(np.tile(np.arange(-lookups.BELOW, 384), (3, 1)), axis=1)
+    fraction = np.random.default_rng(7).integers(0, UNIT, values.shape)
+    words = np.zeros(values.shape[1], dtype=np.uint64)
+    for channel, (value, part) in enumerate(zip(values, fraction, strict=True)):
+        words += ((value + lookups.BELOW) * UNIT + part).astype(np.uint64) << np.uint64(channel * lookups.FIELD)
+    words >>= np.uint64(lookups.SHIFT)
+    lookups._clip(words)
+    shown = np.empty((len(words), 3), dtype=np.uint8)
+    lookups._unpack(words, shown)
+    np.testing.assert_array_equal(shown, np.clip(values, 0, 255).T)
+
+
+CAMERA = Camera.pinhole(800, 800, 199.5, 149.5, *SIZE)
+PANE = Chamber((0, 0, 1), 0.057, (Panel(0.003, 1.49),))
+DROPS = [
+    SphericalCap((x, y), radius, angle)
+    for x, y, radius, angle in ((-6e-3, -4e-3, 1e-3, 0.35), (5e-3, 3e-3, 1.2e-3, 0.7), (6.5e-3, 3.2e-3, 1e-3, 1.1))
+]
+
+
+def test_plans_that_last_are_within_a_gray_level_of_many_rays():
+    """Some pixels in drops against 24 x 24 exact rays each."""
+    image = photograph().astype(np.uint8)
+    plan, default = (Renderer(CAMERA, PANE, lasting=lasting).plan(DROPS) for lasting in (True, False))
+    found, other = plan.render(image), default.render(image)
+    for name in ("opacity", "displacement", "unknown", "drop_mask"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
+    taps = [sum(len(table.texels) for table in each.tables) for each in (plan, default)]
+    assert taps[0] < 0.8 * taps[1]
+    rows, columns = np.nonzero(found.opacity == 1)
+    some = np.random.default_rng(8).permutation(len(rows))[:400]
+    own = np.stack([columns[some], rows[some]], -1).astype(float)
+    along = (np.arange(24) + 0.5) / 24 - 0.5
+    seen = trace(own[:, None] + np.stack(np.meshgrid(along, along), -1).reshape(-1, 2), DROPS, CAMERA, PANE)
+    lit = seen.status == Fate.THROUGH
+    gain = np.where(lit, seen.transmittance / clear_transmittance(own, CAMERA, PANE)[:, None], 0)
+    at = folded(np.where(lit[..., None], seen.source, 0), SIZE)
+    expected = (cv2.remap(image.astype(np.float32), at, np.zeros(0), cv2.INTER_LINEAR) * gain[..., None]).mean(1)
+    assert (lit.mean(1) > 0).mean() > 0.5
+    assert rms(found.image[rows[some], columns[some]] - np.minimum(expected, 255)) <= 1
+
+
+def test_plans_that_last_do_not_depend_on_the_other_drops():
+    renderer, image = Renderer(CAMERA, PANE, lasting=True), photograph().astype(np.uint8)
+    sequence = renderer.sequence()
+    frames = [each.apply(image) for each in (renderer.plan(DROPS), renderer.plan(DROPS[::-1]), sequence.plan(DROPS))]
+    np.testing.assert_array_equal(frames[0], frames[1])
+    np.testing.assert_array_equal(frames[0], frames[2])
+    np.testing.assert_array_equal(sequence.plan(DROPS[1:]).apply(image), renderer.plan(DROPS[1:]).apply(image))
+    with pytest.raises(ValueError, match="moving and lasting"):
+        Renderer(CAMERA, PANE, moving=True, lasting=True)
+
+
+def test_plans_that_last_for_other_types():
+    """The same in 16 bits, in floating point and in gray."""
+    image = photograph().astype(np.uint8)
+    plan = Renderer(CAMERA, PANE, lasting=True).plan(DROPS)
+    bytes_ = plan.apply(image).astype(float)
+    assert np.abs(plan.apply(image.astype(np.uint16) * 257) / 257 - bytes_).max() <= 1.5
+    assert np.abs(np.clip(plan.apply(image.astype(np.float32) / 255) * 255, 0, 255) - bytes_).max() <= 1.5
+    np.testing.assert_array_equal(plan.apply(np.ascontiguousarray(image[..., 1])), bytes_[..., 1])
