@@ -135,8 +135,10 @@ def _width_work(image: Image, quick: bool) -> Work:
     if not quick:
         slim = _random(GeneratorConfig(base_channels=32))
         by_onnx = _onnx(slim, torch.get_num_threads())
+        half = TorchNetwork(copy.deepcopy(slim), "cpu", "bf16")
         call, none = partial(by_onnx, tensor), lambda _: float("nan")
         variants.append(Variant("base_channels 32, ONNX Runtime", call, none, True, every=5))
+        variants.append(Variant("base_channels 32, bf16", partial(half, tensor), none, True, every=15))
     target = () if quick else (Target("base_channels 32", None, 1 / 4),)
     return Work(
         "widths", "The paper's network, by its width", "Bare network calls, float32, random weights.", tuple(variants),

@@ -32,11 +32,11 @@ TENTH = 0.1
 """Share of a frame that drops cover in the middle cases."""
 HEAVY = 0.6
 VISIBLE = 0.15
-MANY = 4
+MANY = 6
 SECONDS = 8
 """Frames of the videos."""
-PAIRS = ((0.05, 0.3), (0.1, 0.5), (0.2, 0.6), (0.3, 0.8), (0.5, 0.8), (0.5, 0.9), (0.6, 0.95))
-"""Thresholds that are compared: of cells around, and of one cell at least."""
+PAIRS = ((0.02, 0.05), (0.05, 0.1), (0.05, 0.15), (0.05, 0.2), (0.05, 0.3), (0.05, 0.4), (0.1, 0.3))
+"""Thresholds that are compared: of cells that are restored if computed, and of those that are worth it."""
 
 
 @dataclass(frozen=True)
@@ -95,15 +95,27 @@ def _all(restore: Callable[[Image], Image], images: Sequence[Image]) -> list[Ima
     return [restore(image) for image in images]
 
 
-def _lost(whole: Restorer, views: Sequence[View], images: Sequence[Image]) -> Callable[[Sequence[Image]], float]:
-    """dB that are lost on average against computing everything; where nothing is wrong, 99 dB."""
-    at_best = [min(psnr(v.clear, whole(image)), 99.0) for v, image in zip(views, images, strict=True)]
+@dataclass(frozen=True)
+class _Lost:
+    """dB that are lost against computing everything; where nothing is wrong, 99 dB are reached."""
 
-    def lost(found: Sequence[Image]) -> float:
-        reached = [min(psnr(v.clear, image), 99.0) for v, image in zip(views, found, strict=True)]
-        return float(np.mean(at_best) - np.mean(reached))
+    views: Sequence[View]
+    at_best: list[float]
 
-    return lost
+    @classmethod
+    def against(cls, whole: Restorer, views: Sequence[View], images: Sequence[Image]) -> _Lost:
+        return cls(views, [min(psnr(v.clear, whole(image)), 99.0) for v, image in zip(views, images, strict=True)])
+
+    def each(self, found: Sequence[Image]) -> Array:
+        reached = [min(psnr(v.clear, image), 99.0) for v, image in zip(self.views, found, strict=True)]
+        return np.asarray(self.at_best) - reached
+
+    def mean(self, found: Sequence[Image]) -> float:
+        return float(self.each(found).mean())
+
+    def also(self, shares: dict[str, float], found: Sequence[Image]) -> dict[str, float]:
+        """With the loss of the worst frame."""
+        return {"lost at worst, dB": float(self.each(found).max()), **shares}
 
 
 def _shares(found: Sequence[Restored]) -> dict[str, float]:
@@ -111,8 +123,8 @@ def _shares(found: Sequence[Restored]) -> dict[str, float]:
     return {"marked, %": 100 * float(marked), "computed, %": 100 * float(computed)}
 
 
-def _also(found: dict[str, float], _: object) -> dict[str, float]:
-    return found
+ALL = {"lost at worst, dB": 0.0, "marked, %": 100.0, "computed, %": 100.0}
+"""Where everything is computed."""
 
 
 def skip_work(shipped: Network, views: list[View], promised: bool) -> Work:
@@ -123,15 +135,13 @@ def skip_work(shipped: Network, views: list[View], promised: bool) -> Work:
         "no drops": [v.clear for v in views], "a tenth, in one place": [v.together for v in views],
         "a tenth, scattered": [v.scattered for v in views], "drops all over": [v.full for v in views],
     }  # fmt: skip
-    none = {"marked, %": 100.0, "computed, %": 100.0}
     run = partial(_all, whole, cases["drops all over"])
-    variants = [Variant(everything, run, lambda _: 0.0, also=partial(_also, none), note="full-drop frame")]
+    variants = [Variant(everything, run, lambda _: 0.0, also=lambda _: ALL, note="full-drop frame")]
     for name, images in cases.items():
         shares = _shares([skipping.restored(image) for image in images])
-        variants.append(
-            Variant(name, partial(_all, skipping, images), _lost(whole, views, images), True,
-                    also=partial(_also, shares))
-        )  # fmt: skip
+        lost = _Lost.against(whole, views, images)
+        run = partial(_all, skipping, images)
+        variants.append(Variant(name, run, lost.mean, True, also=partial(lost.also, shares)))
     targets = [Target("no drops", everything, 0.1)]
     targets += [Target(name, everything, 0.5) for name in ("a tenth, in one place", "a tenth, scattered")]
     return Work(
@@ -146,17 +156,20 @@ def skip_work(shipped: Network, views: list[View], promised: bool) -> Work:
 def curve_work(shipped: Network, views: list[View], quick: bool) -> Work:
     """Quality against time over the way, the halo and the thresholds, on scattered drops."""
     images, whole = [v.scattered for v in views], Restorer(network=shipped, skip=False)
-    lost, weights = _lost(whole, views, images), detector.load(detector.shipped())
-    variants = [Variant("everything", partial(_all, whole, images), lost, also=partial(_also, _full()))]
+    lost, weights = _Lost.against(whole, views, images), detector.load(detector.shipped())
+    variants = [Variant("everything", partial(_all, whole, images), lost.mean, also=lambda _: ALL)]
 
     def add(name: str, made: Restorer) -> None:
         shares = _shares([made.restored(image) for image in images])
-        variants.append(Variant(name, partial(_all, made, images), lost, True, also=partial(_also, shares)))
+        also = partial(lost.also, shares)
+        variants.append(Variant(name, partial(_all, made, images), lost.mean, True, also=also))
 
     default = f"halo {CELLS_HALO}, thresholds {THRESHOLD:g}, {CERTAIN:g}: the defaults"
     add(default, Restorer(network=shipped))
     for halo in (32,) if quick else (32, 64):
         add(f"halo {halo}", Restorer(network=shipped, halo=halo))
+    add("cells around never looked at", Restorer(network=shipped, around=0.0))
+    add("cells around always looked at", Restorer(network=shipped, around=9.0))
     for halo in (32,) if quick else (0, 32):
         add(f"in rectangles, halo {halo}", Restorer(network=_Rectangles(shipped), halo=halo))
     for low, high in PAIRS[:1] if quick else PAIRS:
@@ -166,18 +179,14 @@ def curve_work(shipped: Network, views: list[View], quick: bool) -> Work:
     made = Restorer(network=shipped)
     told = [made.with_cells(v.scattered, v.drops) for v in views]
     variants.append(Variant(
-        "cells with drops, if known", lambda: [made.with_cells(v.scattered, v.drops).image for v in views], lost, True,
-        "no detector: as the renderer knows", also=partial(_also, _shares(told)),
+        "cells with drops, if known", lambda: [made.with_cells(v.scattered, v.drops).image for v in views], lost.mean,
+        True, "no detector: as the renderer knows", also=partial(lost.also, _shares(told)),
     ))  # fmt: skip
     return Work(
         "curve", "Halo and thresholds, by what they cost",
         "A tenth of the frame under scattered drops. What is not named is the default.",
         tuple(variants), default, "dB", "PSNR lost against no skipping", len(views), "frames",
     )  # fmt: skip
-
-
-def _full() -> dict[str, float]:
-    return {"marked, %": 100.0, "computed, %": 100.0}
 
 
 class _Rectangles:

@@ -43,9 +43,9 @@ class Options:
     skip: bool = True
     """Whether cells without drops are left as they are, and not computed."""
     threshold: float | None = None
-    """Probability from which a cell next to a drop belongs to it."""
+    """Harm by drops, 0 to 1, from which on a cell is restored, too, where its surroundings are computed anyway."""
     certain: float | None = None
-    """Probability that a drop has somewhere; lower finds more drops, and more that are none."""
+    """Harm from which on a cell is worth computing; lower finds fainter drops, and more that are none."""
     halo: int | None = None
     """Pixels that the network sees around what it restores."""
     tile: int | None = None

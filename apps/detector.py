@@ -37,7 +37,7 @@ class Options:
     images: tyro.conf.Positional[tuple[str, ...]]
     """Clear images: files, folders or quoted globs; larger than 256 x 192 pixels."""
     banks: tuple[Path, ...] = ()
-    """Folders that rainstereo rain --masks made of these images, to learn from in place of rain on crops of them."""
+    """Folders that rainstereo rain made of these images, to learn from in place of rain on crops of them."""
     out: Path = Path("detector.safetensors")
     """File to write."""
     start: Path | None = None
@@ -81,43 +81,43 @@ def run(options: Options) -> int:
     if len(data) > MOST_BYTES:
         raise ValueError(f"the weights have {len(data)} bytes; expected {MOST_BYTES} at most")
     write_atomically(options.out, data)
-    found = {"loss": made.loss, "cells_found": made.found, "cells_marked_falsely": made.false}
+    found = {"loss": made.loss, "harm_found": made.found, "cells_marked_falsely": made.false}
     card = {
         "name": "drop detector", "bytes": len(data), "training_images": len(images), "recipe": asdict(recipe),
-        "rain": f"{_rain(options)}; masks of the renderer, opacity above {detector_training.VISIBLE:g}",
+        "rain": _rain(options), "harm": f"squared change over {detector_training.HURTS:g} levels squared",
         "held_out": found, "versions": {k: v for k, v in versions().items() if k in ("rainstereo", "torch")},
     }  # fmt: skip
     write_atomically(options.out.with_suffix(".toml"), to_toml(card).encode())
     record["held_out"], record["bytes"] = found, len(data)
     record.write(options.out.with_name(f"{options.out.stem}.report.json"))
     console.print(
-        f"{options.out}: {len(data)} bytes; of held-out cells with a drop {100 * made.found:.0f} % are found, of those "
-        f"without one {100 * made.false:.1f} % marked",
+        f"{options.out}: {len(data)} bytes; of the harm in held-out crops {100 * made.found:.0f} % is in marked cells, "
+        f"of the cells without any {100 * made.false:.1f} % are marked",
         soft_wrap=True,
     )
     return DONE
 
 
 def banked(named: dict[str, Image], banks: Sequence[Path], seed: int) -> Callable[[int], Rained]:
-    """Images under rain, from folders of `rainstereo rain --masks`: each is met once before any is met again."""
+    """Images under rain, from folders of `rainstereo rain`: each is met once before any is met again."""
     from rainstereo.model.detector_training import Rained
 
     found = []
     for bank in banks:
-        masks = {path.stem: path for path in sorted((bank / "masks").glob("*.png"))}
-        both = [(name, bank / f"{name}.png", masks[name]) for name in sorted(named.keys() & masks.keys())]
-        found += [entry for entry in both if entry[1].is_file()]
+        rainy = {path.stem: path for path in sorted(bank.glob("*.png"))}
+        both = [(name, rainy[name]) for name in sorted(named.keys() & rainy.keys())]
+        found += both
         if not both:
             raise ValueError(
-                f"{bank} holds no masks of these images; make some with rainstereo rain IMAGES --masks --out {bank}"
+                f"{bank} holds none of these images under rain; make them with rainstereo rain IMAGES --out {bank}"
             )
     order = np.random.default_rng(seed).permutation(len(found))
 
     def rained(number: int) -> Rained:
-        name, rainy, mask = found[order[number % len(found)]]
-        given = Rained(named[name], imagefile.read(rainy), imagefile.read(mask)[..., 1] / np.float32(255))
-        if given.rainy.shape != given.clear.shape or given.opacity.shape != given.clear.shape[:2]:
-            raise ValueError(f"{rainy} or its mask has not the size of the clear image {name}; render it again")
+        name, rainy = found[order[number % len(found)]]
+        given = Rained(named[name], imagefile.read(rainy))
+        if given.rainy.shape != given.clear.shape:
+            raise ValueError(f"{rainy} has not the size of the clear image {name}; render it again")
         return given
 
     return rained

@@ -10,8 +10,9 @@ et al., "SBNet" (CVPR 2018).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -20,7 +21,7 @@ from torch.nn import functional
 from rainstereo.model.convolution_blocks import ResidualBlock
 from rainstereo.model.generator import Generator, GeneratorConfig
 from rainstereo.model.image_batch import RGB
-from rainstereo.types import Image, Mask
+from rainstereo.types import Array, Image, Mask
 
 AS_MATRIX = 3
 """Side of the window, in places, up to which a convolution is one product of matrices, zeros and all: faster there."""
@@ -37,7 +38,8 @@ class CellGenerator:
     """A generator in eval mode, with weights of this kind, by cells. ValueError where it is not `supported`.
 
     cell: side of a cell, pixels. border: pixels around a cell that must be given with it. What else a pixel depends on
-    is taken from the other cells that are computed.
+    is taken from the other cells that are computed, and at the coarsest scale from those that are only looked at: they
+    go through the way down alone, a sixth of the work, and stay as they are from there on.
     """
 
     def __init__(self, generator: Generator, kind: torch.dtype = torch.float32) -> None:
@@ -49,23 +51,27 @@ class CellGenerator:
         self.kind = kind
         self._matrices: dict[int, tuple[Tensor, Tensor | None]] = {}
 
-    def __call__(self, patches: Tensor, where: Mask) -> Tensor:
+    def __call__(self, patches: Tensor, where: Mask, looked: Mask | None = None) -> Tensor:
         """Restored cells, (N, 3, cell, cell) RGB in 0..1.
 
-        where: (rows, columns) of the image's cells, N of them true. patches: those, row by row, with the border around
-        them, (N, 3, cell + 2 border, ...) RGB in 0..1; zeros beyond the image.
+        where: (rows, columns) of the image's cells, N of them true. looked: M cells, those and others that are looked
+        at; None: no others. patches: the cells looked at, row by row, with the border around them,
+        (M, 3, cell + 2 border, ...) RGB in 0..1; zeros beyond the image.
         """
-        count, side = int(where.sum()), self.cell + 2 * self.border
-        if tuple(patches.shape) != (count, RGB, side, side) or count == 0:
+        looked = where if looked is None else looked
+        count, side = int(looked.sum()), self.cell + 2 * self.border
+        if tuple(patches.shape) != (count, RGB, side, side) or not where.any():
             raise ValueError(
                 f"patches have shape {tuple(patches.shape)} for {count} cells; expected ({count}, 3, {side}, {side}), "
                 "and at least one cell"
             )
+        if looked.shape != where.shape or (where & ~looked).any():
+            raise ValueError("some cells are to be restored that are not looked at; expected all of them to be")
         with torch.inference_mode():
-            return self._restored(patches.to(self.kind), _Places(where, patches.device))
+            return self._restored(patches.to(self.kind), _Found(where, looked, patches.device))
 
-    def _restored(self, patches: Tensor, places: _Places) -> Tensor:
-        made, config = self.generator, self.config
+    def _restored(self, patches: Tensor, found: _Found) -> Tensor:
+        made, config, places = self.generator, self.config, found.looked
         size = self.cell // config.patch
         seen = functional.pixel_unshuffle(patches, config.patch) if config.patch > 1 else patches
         stem = cast(nn.Conv2d, made.stem[0])
@@ -74,25 +80,41 @@ class CellGenerator:
         skips = []
         for blocks, step in zip(made.encoder_blocks, made.downs, strict=True):
             features = self._blocks(cast(nn.Sequential, blocks), features, places)
-            skips.append(features)
+            skips.append(found.restored_of(features))
             features = _after(cast(nn.Sequential, step), self._layer(_first(step), features, places))
-        features = self._blocks(made.blocks, features, places)
+        features, places = found.restored_of(self._inner_blocks(features, found)), found.restored
         for step, blocks in zip(made.ups, made.decoder_blocks, strict=True):
             raised = self._up(cast(nn.Sequential, step), features, places)
             features = self._blocks(cast(nn.Sequential, blocks), raised + skips.pop(), places)
         drawn = self._layer(made.head, features, places)
         begin = self.border
-        images = patches[:, :, begin : begin + self.cell, begin : begin + self.cell]
+        images = found.restored_of(patches)[:, :, begin : begin + self.cell, begin : begin + self.cell]
         assert drawn.shape[2:] == (size, size)  # noqa: S101
         return made.drawn_on(images, drawn)[0].float().clamp(0, 1)
 
     def _blocks(self, blocks: nn.Sequential, features: Tensor, places: _Places) -> Tensor:
         for block in blocks:
-            changed = features
-            for layer in cast(ResidualBlock, block).change:
-                changed = self._layer(layer, changed, places) if isinstance(layer, nn.Conv2d) else layer(changed)
-            features = features + changed
+            features = features + self._change(cast(ResidualBlock, block), features, places, places)
         return features
+
+    def _inner_blocks(self, features: Tensor, found: _Found) -> Tensor:
+        """At the coarsest scale, of cells looked at; those that are not restored stay as they are."""
+        if found.rows is None:
+            return self._blocks(self.generator.blocks, features, found.restored)
+        for block in self.generator.blocks:
+            change = self._change(cast(ResidualBlock, block), features, found.between, found.restored)
+            features = features.index_add(0, found.rows, change)
+        return features
+
+    def _change(self, block: ResidualBlock, features: Tensor, first: _Places, rest: _Places) -> Tensor:
+        """first: where its first convolution is computed, of which features; rest: the same for the others."""
+        changed, places = features, first
+        for layer in block.change:
+            if isinstance(layer, nn.Conv2d):
+                changed, places = self._layer(layer, changed, places), rest
+            else:
+                changed = layer(changed)
+        return changed
 
     def _up(self, step: nn.Sequential, features: Tensor, places: _Places) -> Tensor:
         first = step[0]
@@ -112,7 +134,7 @@ class CellGenerator:
         conv = cast(nn.Conv2d, layer)
         before = conv.kernel_size[0] // 2
         after, run = before if conv.stride[0] == 1 else 0, _valid(conv)
-        windows = places.windows(features, before, after) if before or after else features
+        windows = places.windows(features, before, after) if before or after or places.fewer else features
         side = windows.shape[2]
         if side > AS_MATRIX or conv.groups > 1:
             return run(windows)
@@ -149,37 +171,61 @@ class CellGenerator:
         return found
 
 
-class _Places:
-    """Where the cells are, and so which rows of features lie around each of them."""
+class _Found:
+    """Which cells are looked at and which restored, as places.
 
-    def __init__(self, where: Mask, device: torch.device) -> None:
+    between: restored ones among those looked at. rows: of the restored ones, among those looked at; None: they are all.
+    """
+
+    def __init__(self, restored: Mask, looked: Mask, device: torch.device) -> None:
+        self.looked = _Places(looked, looked, device)
+        if np.array_equal(restored, looked):
+            self.restored = self.between = self.looked
+            self.rows: Tensor | None = None
+        else:
+            self.restored, self.between = _Places(restored, restored, device), _Places(restored, looked, device)
+            self.rows = torch.from_numpy(self.looked.numbers[restored]).to(device)
+
+    def restored_of(self, features: Tensor) -> Tensor:
+        """Of the cells looked at, those that are restored."""
+        return features if self.rows is None else features.index_select(0, self.rows)
+
+
+class _Places:
+    """Where cells are, and so which rows of features lie around each of them.
+
+    where: of these, windows are made. given: of these there are features. fewer: whether some have features only.
+    """
+
+    def __init__(self, where: Mask, given: Mask, device: torch.device) -> None:
         self.rows, self.columns = np.nonzero(where)
-        self.numbers = np.full(where.shape, -1, np.int64)
-        self.numbers[where] = np.arange(len(self.rows))
+        self.count = int(given.sum())
+        self.numbers = np.full(given.shape, self.count)  # of what is not given: rows of zeros after all others
+        self.numbers[given] = np.arange(self.count)
+        self.fewer = len(self.rows) < self.count
         self.device = device
         self._known: dict[tuple[int, int, int], Tensor] = {}
 
     def windows(self, features: Tensor, before: int, after: int) -> Tensor:
         """(N, C, k, k) -> (N, C, before + k + after, ...): each cell with what its neighbours hold beside it, or 0."""
-        count, channels, size = features.shape[:3]
+        channels, size = features.shape[1:3]
         flat = features.permute(0, 2, 3, 1).reshape(-1, channels)
-        flat = torch.cat([flat, flat.new_zeros(1, channels)])
+        flat = torch.cat([flat, flat.new_zeros(size * size, channels)])
         wide = before + size + after
         found = flat.index_select(0, self._around(size, before, after))
-        return found.view(count, wide, wide, channels).permute(0, 3, 1, 2)
+        return found.view(len(self.rows), wide, wide, channels).permute(0, 3, 1, 2)
 
     def _around(self, size: int, before: int, after: int) -> Tensor:
-        """Rows of the features of all cells, for each place of each window; the one after the last where none is."""
+        """Rows of the features of all cells, for each place of each window; after the last where none is."""
         key = (size, before, after)
         if key not in self._known:
-            steps = np.arange(-before, size + after)
-            down, right = steps[:, None] // size, steps[None] // size
-            beyond = -(-max(before, after) // size)
-            padded = np.pad(self.numbers, beyond, constant_values=-1)
-            cells = padded[self.rows[:, None, None] + down + beyond, self.columns[:, None, None] + right + beyond]
-            inside = steps[:, None] % size * size + steps[None] % size
-            index = np.where(cells < 0, len(self.rows) * size * size, cells * size * size + inside)
-            self._known[key] = torch.from_numpy(index.reshape(-1)).to(self.device)
+            down, right = self.numbers.shape
+            wide = np.full((down * size + before + after, right * size + before + after), self.count * size * size)
+            inside = wide[before : before + down * size, before : before + right * size]
+            place = np.arange(size * size).reshape(size, 1, size)
+            np.add(self.numbers[:, None, :, None] * size * size, place, out=inside.reshape(down, size, right, size))
+            found = _squares(wide, size, before + size + after)[self.rows, self.columns]
+            self._known[key] = torch.from_numpy(found.reshape(-1)).to(self.device)
         return self._known[key]
 
 
@@ -189,15 +235,18 @@ def patches(image: Image, where: Mask, cell: int, border: int) -> Image:
     Cells that reach over the image's edge see it mirrored, as the generator pads it; zeros follow.
     """
     rows, columns = where.shape
-    height, width = image.shape[:2]
-    side = cell + 2 * border
-    wide = _mirrored(image, rows * cell - height, columns * cell - width)
-    found: Image = np.zeros((int(where.sum()), side, side, *image.shape[2:]), image.dtype)
-    for patch, row, column in zip(found, *np.nonzero(where), strict=True):
-        top, left = int(row) * cell - border, int(column) * cell - border
-        part = wide[max(0, top) : top + side, max(0, left) : left + side]
-        patch[max(0, -top) : max(0, -top) + len(part), max(0, -left) : max(0, -left) + part.shape[1]] = part
+    wide = _mirrored(image, rows * cell - image.shape[0], columns * cell - image.shape[1])
+    wide = cv2.copyMakeBorder(wide, *(border,) * 4, cv2.BORDER_CONSTANT)
+    found: Image = _squares(cast(Any, wide), cell, cell + 2 * border)[where]
     return found
+
+
+def _squares(wide: Array, step: int, side: int) -> Array:
+    """(rows, columns, side, side, ...) without a copy: squares of a picture, one every `step` places."""
+    down, right, *rest = wide.strides
+    count = [(length - side) // step + 1 for length in wide.shape[:2]]
+    shape, strides = (*count, side, side, *wide.shape[2:]), (step * down, step * right, down, right, *rest)
+    return np.lib.stride_tricks.as_strided(wide, shape, strides, writeable=False)
 
 
 def _mirrored(image: Image, down: int, right: int) -> Image:

@@ -24,13 +24,15 @@ from rainstereo.types import Array, Image, Mask
 
 CELL = 16
 """Pixels along a cell's side; a multiple of every network's own cell, and of the generator's stride."""
+UNIT = 2 * CELL
+"""Side, at least, of the squares of an image in which one cell that is worth computing has others restored with it."""
 OWN = 4
 """Pixels of the averaged image along the side of a cell of the network's."""
 FACTORS = (1, 2, 4)
 ROWS = 180
 """Rows that the averaged image has at least, if the image has them."""
-THRESHOLD = 0.5
-CERTAIN = 0.9
+THRESHOLD, CERTAIN = 0.1, 0.6
+"""From the curve of `rainstereo bench derain`, over the time that each takes and what it leaves in the rain."""
 MOST_BYTES = 1 << 20
 
 
@@ -52,7 +54,7 @@ class DetectorConfig:
 
 
 class DropDetector(nn.Module):
-    """(B, 3, H, W) RGB in 0..1, averaged down -> (B, 1, ceil(H / 4), ceil(W / 4)): logits of a drop in the cell."""
+    """(B, 3, H, W) RGB in 0..1, averaged down -> (B, 1, ceil(H / 4), ceil(W / 4)): logits of the harm in a cell."""
 
     def __init__(self, config: DetectorConfig) -> None:
         super().__init__()
@@ -74,7 +76,8 @@ class DropDetector(nn.Module):
 class Detector:
     """Cells of an image that hold drops, or may; `Detector.shipped()` has the package's weights.
 
-    A drop is where the network is certain, and as far around as it finds one likelier than the threshold.
+    certain: harm to be expected of a cell from which on it is worth computing. threshold: of a cell from which on it is
+    restored, too, where it is computed anyway.
     """
 
     def __init__(
@@ -82,7 +85,7 @@ class Detector:
         certain: float = CERTAIN,
     ) -> None:  # fmt: skip
         if not 0 <= threshold <= 1 or not 0 <= certain <= 1:
-            raise ValueError(f"thresholds of {threshold} and {certain} were given; expected probabilities, 0 to 1")
+            raise ValueError(f"thresholds of {threshold} and {certain} were given; expected shares of harm, 0 to 1")
         self.device, self.threshold, self.certain = torch.device(device), threshold, max(certain, threshold)
         fast = _fused(network.eval()).to(self.device)
         self.network = cast(Any, fast).to(memory_format=torch.channels_last)  # which has no types for modules
@@ -101,8 +104,10 @@ class Detector:
         """With the weights in the package."""
         return cls.load(shipped(), device, threshold, certain)
 
-    def probability(self, image: Image, factor: int | None = None) -> Array:
-        """Of a drop in each cell, (ceil(H / CELL), ceil(W / CELL)): the largest of the network's own cells in it.
+    def harm(self, image: Image, factor: int | None = None) -> Array:
+        """To be expected in each cell, (ceil(H / CELL), ceil(W / CELL)), in 0..1: the most in the network's own cells.
+
+        1 is a change by 24 gray levels, RMS, or more; less counts by its square.
 
         image: uint8 or uint16, gray or BGR. factor: by which it is averaged down first, 1, 2 or 4; None: by its size.
         """
@@ -115,20 +120,19 @@ class Detector:
         rows, columns = -(-image.shape[0] // CELL), -(-image.shape[1] // CELL)
         return cast(Array, found[0, 0, :rows, :columns].cpu().numpy())
 
-    def cells(self, image: Image, factor: int | None = None) -> Mask:
-        """(ceil(H / CELL), ceil(W / CELL)): which cells hold a drop."""
-        return grown_from(self.probability(image, factor), self.threshold, self.certain)
+    def cells(self, image: Image, factor: int | None = None, unit: int = UNIT) -> Mask:
+        """(ceil(H / CELL), ceil(W / CELL)): which cells are restored. unit: pixels along a side of the squares of the
+        image, a multiple of CELL, that are computed or not."""
+        return near_certain(self.harm(image, factor), self.threshold, self.certain, unit // CELL)
 
 
-def grown_from(probability: Array, low: float, high: float) -> Mask:
-    """Where a probability is at least low, in groups of touching cells of which one has at least high."""
-    count, groups = cv2.connectedComponents((probability >= low).astype(np.uint8), connectivity=8)
-    if count == 1:
-        return np.zeros(probability.shape, bool)
-    kept = np.zeros(count, bool)
-    kept[groups[probability >= high]] = True
-    kept[0] = False
-    return np.asarray(kept[groups])
+def near_certain(harm: Array, low: float, high: float, many: int) -> Mask:
+    """Cells of at least low, in squares of many x many cells of which one has at least high."""
+    rows, columns = harm.shape
+    sure = np.pad(harm >= high, ((0, -rows % many), (0, -columns % many)))
+    squares = sure.reshape(sure.shape[0] // many, many, -1, many).any((1, 3))
+    found: Mask = np.repeat(np.repeat(squares, many, 0), many, 1)[:rows, :columns] & (harm >= low)
+    return found
 
 
 def _fused(network: DropDetector) -> nn.Sequential:

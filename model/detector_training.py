@@ -1,7 +1,9 @@
-"""Trains the drop detector: clear images, rain rendered on them by this toolkit, and the renderer's own masks as truth.
+"""Trains the drop detector: clear images, rain rendered on them by this toolkit, and what the rain changed as truth.
 
-A pool of rainy crops is rendered once; each step draws a batch of them, turned and recoloured anew. A share of the
-batch is clear: sharp, blurred, noisy or compressed, so that blur alone is not taken for a drop.
+A cell's label is the harm done to it: the mean square change of its pixels, over that from which more counts no
+further. So the network's answer is the harm to expect, and what one hardly sees need not be found. A pool of rainy
+crops is rendered once; each step draws a batch of them, turned and recoloured anew. A share of the batch is clear:
+sharp, blurred, noisy or compressed, so that blur alone is not taken for a drop.
 """
 
 from __future__ import annotations
@@ -16,15 +18,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from rainstereo.model.augment import RandomAdherentRain
-from rainstereo.model.detector import OWN, DetectorConfig, DropDetector
-from rainstereo.types import Array, Image
+from rainstereo.model.detector import OWN, THRESHOLD, DetectorConfig, DropDetector
+from rainstereo.types import Image
 
-VISIBLE = 0.15
-"""Opacity from which a drop counts: below, the clear scene is what one sees."""
-HURTS = 16.0
-"""Gray levels, on average over a cell, of a drop that counts as much in the loss as a cell without one."""
-WEIGHTS = 0.1, 3.0
-"""Least and most that a cell with a drop counts."""
+HURTS = 24.0
+"""Gray levels, RMS over a cell, of a change that is all the harm that a drop can do."""
+NONE = 0.01
+"""Harm below which a cell is as good as clear."""
 
 
 @dataclass(frozen=True)
@@ -42,27 +42,24 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Rained:
-    """An image, the same under rain, both uint8 BGR, and the opacity of its drops, (H, W) in 0..1."""
+    """An image, and the same under rain, both uint8 BGR."""
 
     clear: Image
     rainy: Image
-    opacity: Array
 
 
 @dataclass(frozen=True)
 class Pool:
-    """What is trained on. crops: (N, 3, H, W) uint8 RGB. labels: (N, 1, H / 4, W / 4), a visible drop there.
-    weights: how much each of these counts; drops that one hardly sees count little."""
+    """What is trained on. crops: (N, 3, H, W) uint8 RGB. labels: (N, 1, H / 4, W / 4), the harm there in 0..1."""
 
     crops: Tensor
     labels: Tensor
-    weights: Tensor
 
 
 @dataclass(frozen=True)
 class Trained:
-    """The network; the mean loss of the last tenth of the steps; and of cells of held-out crops: which share of those
-    with a drop is found, and which share of those without one is marked all the same."""
+    """The network; the mean loss of the last tenth of the steps; and of held-out crops, with what is above `THRESHOLD`
+    marked: which share of all harm is in marked cells, and which share of cells without any is marked all the same."""
 
     network: DropDetector
     loss: float
@@ -99,14 +96,14 @@ def train(
             pool = rendered(images, rains, recipe.pool, recipe.size, draws, told)
         held = max(1, len(pool.crops) // 16)
         network = (start or config.build()).train()
-        rest = Pool(pool.crops[held:], pool.labels[held:], pool.weights[held:])
+        rest = Pool(pool.crops[held:], pool.labels[held:])
         losses = _fit(network, rest, images, recipe, draws, told)
     network.eval()
     with torch.inference_mode():
-        seen = network(pool.crops[:held].float() / 255).sigmoid() > 0.5
-    truth = pool.labels[:held]
+        seen = network(pool.crops[:held].float() / 255).sigmoid() > THRESHOLD
+    harm = pool.labels[:held]
     tail = losses[-max(1, len(losses) // 10) :]
-    return Trained(network, float(np.mean(tail)), _share(seen, truth), _share(seen, ~truth))
+    return Trained(network, float(np.mean(tail)), _share(seen, harm), _share(seen, (harm < NONE).float()))
 
 
 def _fit(
@@ -118,18 +115,17 @@ def _fit(
     losses = []
     for step in range(recipe.steps):
         chosen = torch.from_numpy(draws.integers(len(pool.crops), size=recipe.batch - clear))
-        rainy, truth, weight = pool.crops[chosen].float() / 255, pool.labels[chosen].float(), pool.weights[chosen]
+        rainy, truth = pool.crops[chosen].float() / 255, pool.labels[chosen]
         if draws.random() < 0.5:
-            rainy, truth, weight = rainy.flip(-1), truth.flip(-1), weight.flip(-1)
+            rainy, truth = rainy.flip(-1), truth.flip(-1)
         dry = torch.stack([_as_tensor(spoiled(crop(images, recipe.size, draws), draws)) for _ in range(clear)] or [])
         batch = torch.cat([rainy, dry.float() / 255]) if clear else rainy
         truth = torch.cat([truth, torch.zeros(clear, *truth.shape[1:])])
-        weight = torch.cat([weight, torch.ones(clear, *weight.shape[1:])])
         gain = torch.from_numpy(draws.uniform(0.6, 1.4, (len(batch), 1, 1, 1)).astype(np.float32))
         tint = torch.from_numpy(draws.uniform(0.9, 1.1, (len(batch), 3, 1, 1)).astype(np.float32))
         noise = torch.from_numpy((draws.random() * 0.02 * draws.standard_normal(batch.shape)).astype(np.float32))
         logits = network((batch * gain * tint + noise).clamp(0, 1))
-        loss = functional.binary_cross_entropy_with_logits(logits, truth, weight)
+        loss = functional.binary_cross_entropy_with_logits(logits, truth)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -149,9 +145,7 @@ def rendered(
         clear = _as_tensor(spoiled(crop(images, size, draws), draws) if number % 4 == 3 else crop(images, size, draws))
         rain = rains[number % len(rains)]
         rainy = rain(clear.float().unsqueeze(0) / 255)
-        if rain.layer is None:
-            raise RuntimeError("the rain left no layer")
-        found.append(_labelled(clear, (255 * rainy[0]).round().clamp(0, 255).to(torch.uint8), rain.layer.opacity[0]))
+        found.append(_labelled(clear, (255 * rainy[0]).round().clamp(0, 255).to(torch.uint8)))
         told("rendering", number + 1, count)
     return _pooled(found)
 
@@ -164,26 +158,22 @@ def cut(
     found = []
     for number in range(count):
         given = rained(number)
-        opacity = np.rint(255 * given.opacity).astype(np.uint8)
-        whole = np.dstack([given.clear, given.rainy, opacity])
-        part = crop([whole], size, draws)
-        clear, rainy, drops = part[..., :3], part[..., 3:6], part[..., 6]
-        found.append(_labelled(_as_tensor(clear), _as_tensor(rainy), torch.from_numpy(drops / np.float32(255))[None]))
+        part = crop([np.dstack([given.clear, given.rainy])], size, draws)
+        found.append(_labelled(_as_tensor(part[..., :3]), _as_tensor(part[..., 3:])))
         told("reading", number + 1, count)
     return _pooled(found)
 
 
-def _labelled(clear: Tensor, rainy: Tensor, opacity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """A crop, which of its cells hold a visible drop, and what each of them counts."""
-    label = functional.max_pool2d(opacity[None], OWN, ceil_mode=True)[0] > VISIBLE
-    change = (rainy.float() - clear.float()).abs().mean(0, keepdim=True)
-    hurts = functional.avg_pool2d(change[None], OWN, ceil_mode=True)[0] / HURTS
-    return rainy, label, torch.where(label, hurts.clamp(*WEIGHTS), 1.0)
+def _labelled(clear: Tensor, rainy: Tensor) -> tuple[Tensor, Tensor]:
+    """A crop, and the harm done to each of its cells."""
+    change = (rainy.float() - clear.float()).square().mean(0, keepdim=True)
+    hurts = functional.avg_pool2d(change[None], OWN, ceil_mode=True)[0] / HURTS**2
+    return rainy, hurts.clamp(max=1)
 
 
-def _pooled(found: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Pool:
-    crops, labels, weights = zip(*found, strict=True)
-    return Pool(torch.stack(crops), torch.stack(labels), torch.stack(weights))
+def _pooled(found: Sequence[tuple[Tensor, Tensor]]) -> Pool:
+    crops, labels = zip(*found, strict=True)
+    return Pool(torch.stack(crops), torch.stack(labels))
 
 
 def crop(images: Sequence[Image], size: tuple[int, int], draws: np.random.Generator) -> Image:
@@ -222,5 +212,6 @@ def _as_tensor(image: Image) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1)))
 
 
-def _share(marked: Tensor, among: Tensor) -> float:
-    return float(marked[among].float().mean()) if bool(among.any()) else float("nan")
+def _share(marked: Tensor, of: Tensor) -> float:
+    """Which share of something, by cell, is in marked ones."""
+    return float(of[marked].sum() / of.sum()) if bool(of.any()) else float("nan")

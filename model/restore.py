@@ -20,6 +20,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 import torch
 
@@ -27,7 +28,7 @@ from rainstereo.model import checkpoint as checkpoints
 from rainstereo.model import detector
 from rainstereo.model.architecture import ARCHITECTURES
 from rainstereo.model.cell_generator import CellGenerator, patches
-from rainstereo.model.detector import CELL, CERTAIN, THRESHOLD, Detector, factor_for
+from rainstereo.model.detector import CELL, CERTAIN, THRESHOLD, UNIT, Detector, factor_for
 from rainstereo.model.image_batch import INPUT
 from rainstereo.model.networks import Network, OnnxNetwork, TorchNetwork, pick_device
 from rainstereo.model.pixels import check, from_batch, from_rgb, to_batch, to_rgb
@@ -43,8 +44,11 @@ MAX_PIXELS = 4 << 20
 CELLS_HALO, PARTS_HALO = 0, 32
 """Pixels of the image around what holds drops that the generator sees, when the rest is skipped: computed by cells,
 or in rectangles. From the curve of `rainstereo bench derain`: more costs time, and hardly raises the quality."""
-BY_CELLS = 1.45
-"""What a pixel costs when single cells are computed, over what it costs in a whole image."""
+BY_CELLS, LOOKING = 1.3, 0.28
+"""What a pixel costs when single cells are computed, over what it costs in a whole image; and one in a cell that is
+only looked at, over one that is computed."""
+AROUND = 0.35
+"""Share of a whole image's cost up to which the cells around those computed are looked at: they are context."""
 RAMP = 4
 """Pixels within a marked cell over which the restored image replaces the given one."""
 OVERLAP = 32
@@ -72,7 +76,8 @@ class Restorer:
     "float16". backend: "torch" or "onnx".
     tile: side, pixels, of the tiles of large images; None: by what may be computed at once, max_pixels.
     skip: whether cells without drops are left as they are; threshold, certain: see `Detector`. halo: pixels that the
-    generator sees around what has drops; None: what pays. A detector of one's own may be given.
+    generator sees around what has drops; None: what pays. around: share of a whole image's cost up to which cells next
+    to those computed are looked at, too. A detector of one's own may be given.
     network: in place of a checkpoint, anything that is a `Network`.
 
     ValueError where the checkpoint is not for such images.
@@ -81,7 +86,7 @@ class Restorer:
     def __init__(
         self, checkpoint: Checkpoint | None = None, device: str | torch.device = "auto", precision: str = "auto",
         tile: int | None = None, skip: bool = True, backend: Backend = "torch", *, threshold: float = THRESHOLD,
-        certain: float = CERTAIN, halo: int | None = None, max_pixels: int = MAX_PIXELS,
+        certain: float = CERTAIN, halo: int | None = None, around: float = AROUND, max_pixels: int = MAX_PIXELS,
         detector: Detector | None = None, network: Network | None = None,
     ) -> None:  # fmt: skip
         if (halo is not None and halo < 0) or (tile is not None and tile < 4 * CELL) or max_pixels < 1 << 16:
@@ -95,9 +100,11 @@ class Restorer:
         step = self.network.multiple
         self.step = step if step % CELL == 0 else int(np.lcm(step, CELL))
         self.by_cells: CellGenerator | None = getattr(self.network, "cells", None)
-        around = halo if halo is not None else CELLS_HALO if self.by_cells else PARTS_HALO
-        self.halo, self.max_pixels = -(-around // self.step) * self.step, max_pixels
+        wide = halo if halo is not None else CELLS_HALO if self.by_cells else PARTS_HALO
+        self.halo, self.max_pixels = -(-wide // self.step) * self.step, max_pixels
+        self.around = around
         self._tile = tile
+        self.unit = max(self.step, UNIT)
 
     def __call__(self, image: Image) -> Image:
         """The image, restored."""
@@ -178,7 +185,7 @@ class Restorer:
         """Which cells of 16 pixels are restored: those with drops, or all where nothing is skipped."""
         if self.detector is None:
             return np.ones((-(-image.shape[0] // CELL), -(-image.shape[1] // CELL)), bool)
-        return self.detector.cells(image, factor)
+        return self.detector.cells(image, factor, self.unit)
 
     def plan(self, cells: Mask, image: Image) -> list[Rect] | Mask:
         """What the generator computes for these cells: rectangles of the image, or the whole of it, or cells of its
@@ -211,21 +218,30 @@ class Restorer:
             _pasted(out, restored, part, cells[top:bottom, left:right])
         return Restored(out, float(cells.mean()), sum(part.area for part in plan) / _area(image))
 
+    def looked_at(self, where: Mask) -> Mask:
+        """Cells that the generator sees when it computes some of its own size: those around, too, if that is cheap."""
+        wide: Mask = cv2.dilate(where.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        cost = BY_CELLS * (where.sum() + LOOKING * (wide.sum() - where.sum())) / where.size
+        return wide if cost <= self.around else where
+
     def _cell_by_cell(self, image: Image, cells: Mask, where: Mask, out: Image) -> int:
         """Restore the marked cells, which lie in the cells `where` something is computed; how many pixels were."""
         made = self.by_cells
         assert made is not None  # noqa: S101
-        given = patches(image, where, made.cell, made.border)
-        inner = slice(made.border, made.border + made.cell)
-        restored = from_batch(made(to_batch(given, self.network.device), where), given[:, inner, inner])
-        weight = ramped(cells, CELL, (image.shape[0], image.shape[1]), RAMP)
-        for whole, row, column in zip(restored, *np.nonzero(where), strict=True):
-            rows = slice(row * made.cell, (row + 1) * made.cell)
-            columns = slice(column * made.cell, (column + 1) * made.cell)
-            mix, before = weight[rows, columns], out[rows, columns]
-            mix = mix[..., None] if out.ndim == 3 else mix
-            found = whole[: before.shape[0], : before.shape[1]].astype(np.float32)
-            before[...] = np.rint(before + mix * (found - before))
+        looked = self.looked_at(where)
+        given = patches(image, looked, made.cell, made.border)
+        like = given[:1, : made.cell, : made.cell]  # whose kind and channels count
+        restored = from_batch(made(to_batch(given, self.network.device), where, looked), like)
+        weight = patches(ramped(cells, CELL, (image.shape[0], image.shape[1]), RAMP), where, made.cell, 0)
+        before = patches(out, where, made.cell, 0)
+        mixed = restored.astype(np.float32)
+        mixed -= before
+        mixed *= weight[..., None] if out.ndim == 3 else weight
+        mixed += before
+        found = np.rint(mixed, out=mixed).astype(out.dtype)
+        for square, row, column in zip(found, *np.nonzero(where), strict=True):
+            part = out[row * made.cell : (row + 1) * made.cell, column * made.cell : (column + 1) * made.cell]
+            part[...] = square[: part.shape[0], : part.shape[1]]
         return len(restored) * made.cell**2
 
     def whole(self, image: Image) -> Image:
@@ -289,7 +305,7 @@ def _pasted(out: Image, restored: Image, part: Rect, cells: Mask) -> Image:
 def leaves_out() -> str:
     """Changes when anything does that decides, by default, which cells are left as they are."""
     weights = detector.shipped().read_bytes()
-    settings = THRESHOLD, CERTAIN, CELLS_HALO, PARTS_HALO, RAMP, BY_CELLS, WHOLE, CALL
+    settings = THRESHOLD, CERTAIN, CELLS_HALO, PARTS_HALO, RAMP, BY_CELLS, LOOKING, AROUND, WHOLE, CALL
     return hashlib.sha256(weights + repr(settings).encode()).hexdigest()
 
 

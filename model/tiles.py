@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
@@ -101,11 +102,16 @@ def _merged(parts: list[Rect], call: int) -> list[Rect]:
 
 def ramped(marked: Mask, cell: int, size: tuple[int, int], ramp: int) -> Array:
     """(H, W) float32: 1 on marked cells, 0 elsewhere, rising from 0 within `ramp` pixels inside what is marked."""
-    wide: Image = np.repeat(np.repeat(marked.astype(np.float32), cell, 0), cell, 1)[: size[0], : size[1]]
-    if ramp:
-        # a box of 2 r + 1 is half full at a straight edge: below one half means outside
-        wide = np.clip(2 * cv2.blur(wide, (2 * ramp + 1,) * 2, borderType=cv2.BORDER_REPLICATE) - 1, 0, 1) * (wide > 0)
-    return np.asarray(wide, np.float32)
+    wide = np.repeat(np.repeat(marked.astype(np.float32), cell, 0), cell, 1)[: size[0], : size[1]]
+    if not ramp:
+        return cast(Array, wide)
+    # a box of 2 r + 1 is half full at a straight edge: below one half means outside
+    soft = cast(Array, cv2.blur(wide, (2 * ramp + 1,) * 2, borderType=cv2.BORDER_REPLICATE))
+    soft *= 2
+    soft -= 1
+    np.clip(soft, 0, 1, out=soft)
+    soft *= wide
+    return soft
 
 
 # -- images that are larger than what can be computed at once ----------------------------------------------------------

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from rainstereo.model.networks import Network
-from rainstereo.model.pixels import RAW, check, from_batch, packed, to_batch, unpacked
+from rainstereo.model.pixels import RAW, check, from_batch, packed, to_batch, turned, unpacked
 from rainstereo.types import Image
 
 AHEAD = 2
@@ -95,7 +95,7 @@ class _Lane:
         most = int(np.iinfo(frames[0].dtype).max)
         staged = self.up.numpy()
         for place, frame in zip(staged, frames, strict=True):
-            np.copyto(place, frame)
+            np.copyto(place, turned(frame) if frame.ndim == 3 else frame)
         with torch.cuda.device(self.device), torch.inference_mode():
             restored: Tensor = network(unpacked(self.up.to(self.device, non_blocking=True), most))
             self.down.copy_(packed(restored, most, frames[0].ndim == 2, self.down.dtype), non_blocking=True)
@@ -105,8 +105,8 @@ class _Lane:
     def receive(self) -> list[Image]:
         """Wait for the batch; frames of their own memory."""
         self.done.synchronize()
-        kind = np.dtype(self.kind[1])
-        return [np.array(frame, kind) for frame in self.down.numpy()]
+        found = self.down.numpy().astype(self.kind[1], copy=False)
+        return [turned(frame) if frame.ndim == 3 else frame.copy() for frame in found]
 
 
 def _kind(frame: Image) -> tuple[tuple[int, ...], str]:

@@ -40,7 +40,7 @@ class RedDetector(Detector):
         super().__init__(DetectorConfig(2, (1,)).build())
         self.looks = 0
 
-    def cells(self, image: Image, factor: int | None = None) -> Mask:
+    def cells(self, image: Image, factor: int | None = None, unit: int = CELL) -> Mask:
         self.looks += 1
         top = np.iinfo(image.dtype).max
         red = (image == (0, 0, top)).all(-1) if image.ndim == 3 else image == top

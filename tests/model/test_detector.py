@@ -13,16 +13,16 @@ from rainstereo import imagefile
 from rainstereo.apps.cli import main
 from rainstereo.model import detector, detector_training
 from rainstereo.model.augment import RandomAdherentRain
-from rainstereo.model.detector import CELL, Detector, DetectorConfig, factor_for, grown_from, packed
+from rainstereo.model.detector import CELL, Detector, DetectorConfig, factor_for, near_certain, packed
 from tests.model.small_restorer import picture
 
 
 @pytest.mark.parametrize("size", [(1, 1), (17, 33), (180, 240), (481, 643), (720, 960)])
-def test_a_probability_for_each_cell(size: tuple[int, int]) -> None:
+def test_a_harm_for_each_cell(size: tuple[int, int]) -> None:
     torch.manual_seed(0)
     found = Detector(DetectorConfig(4, (1, 2)).build())
     for image in (picture(0, size), picture(0, size)[..., 0], picture(0, size).astype(np.uint16) * 257):
-        cells = found.probability(image)
+        cells = found.harm(image)
         assert cells.shape == (-(-size[0] // CELL), -(-size[1] // CELL))
         assert ((cells > 0) & (cells < 1)).all()
 
@@ -35,7 +35,7 @@ def test_what_was_fused_is_the_network() -> None:
     rgb = torch.from_numpy(image[..., ::-1].transpose(2, 0, 1).copy())[None] / 255
     with torch.inference_mode():
         truth = torch.nn.functional.max_pool2d(network.eval()(rgb).sigmoid(), 4)[0, 0].numpy()
-    assert np.abs(Detector(network).probability(image) - truth).max() < 1e-5
+    assert np.abs(Detector(network).harm(image) - truth).max() < 1e-5
 
 
 def test_how_far_an_image_is_averaged() -> None:
@@ -44,14 +44,19 @@ def test_how_far_an_image_is_averaged() -> None:
     ]  # fmt: skip
 
 
-def test_probabilities_grow_from_certain_cells() -> None:
-    for seed in range(20):
-        given = np.random.default_rng(seed).random((12, 17))
-        groups, count = ndimage.label(given >= 0.5, np.ones((3, 3)))  # an independent formulation
-        kept = [i for i in range(1, count + 1) if given[groups == i].max() >= 0.9]
-        assert np.array_equal(grown_from(given, 0.5, 0.9), np.isin(groups, kept))
-    assert not grown_from(np.full((3, 3), 0.5), 0.4, 0.6).any()
-    assert grown_from(np.full((3, 3), 0.7), 0.4, 0.6).all()
+@pytest.mark.parametrize("many", [1, 2, 3])
+def test_cells_are_restored_with_those_that_are_worth_it(many: int) -> None:
+    for seed in range(10):
+        harm = np.random.default_rng(seed).random((12, 17)) ** 2
+        most = ndimage.maximum_filter(harm, many, mode="constant")  # an independent formulation, by windows
+        for row, column in np.ndindex(*harm.shape):
+            corner = row // many * many + many // 2, column // many * many + many // 2
+            inside = corner[0] < 12 and corner[1] < 17
+            square = harm[row // many * many :, column // many * many :][:many, :many].max()
+            assert not inside or most[corner] == square
+            expected = square >= 0.8 and harm[row, column] >= 0.2
+            assert near_certain(harm, 0.2, 0.8, many)[row, column] == expected
+    assert np.array_equal(near_certain(harm, 0.3, 0.5, 1), harm >= 0.5)
 
 
 def test_weights_survive_a_file_and_damage_is_refused(tmp_path: Path) -> None:
@@ -74,7 +79,7 @@ def test_weights_survive_a_file_and_damage_is_refused(tmp_path: Path) -> None:
         detector.load(tmp_path / "b.safetensors")
     with pytest.raises(ValueError, match="is no detector"):
         DetectorConfig(0)
-    with pytest.raises(ValueError, match="expected probabilities"):
+    with pytest.raises(ValueError, match="expected shares"):
         Detector(network, threshold=2)
 
 
@@ -108,15 +113,13 @@ def test_the_command_trains_and_says_what_it_did(tmp_path: Path, capsys: pytest.
 
 def test_the_command_learns_from_banks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "clear").mkdir()
-    (tmp_path / "bank/masks").mkdir(parents=True)
+    (tmp_path / "bank").mkdir()
     for name in "ab":
         clear = cv2.resize(picture(ord(name), (24, 32)), (300, 230))
-        rainy, opacity = clear.copy(), np.zeros((230, 300), np.uint8)
-        opacity[50:150, 60:200] = 255
-        rainy[opacity > 0] = cv2.blur(clear, (31, 31))[opacity > 0]
+        rainy = clear.copy()
+        rainy[50:150, 60:200] = cv2.blur(clear, (31, 31))[50:150, 60:200]
         imagefile.write(tmp_path / f"clear/{name}.png", clear)
         imagefile.write(tmp_path / f"bank/{name}.png", rainy)
-        imagefile.write(tmp_path / f"bank/masks/{name}.png", np.dstack([0 * opacity, opacity, opacity]))
     given = ["detector", str(tmp_path / "clear"), "--steps", "10", "--batch", "2", "--pool", "3"]
     first, second = tmp_path / "d.safetensors", tmp_path / "e.safetensors"
     assert main([*given, "--banks", str(tmp_path / "bank"), "--out", str(first)]) == 0
@@ -125,24 +128,21 @@ def test_the_command_learns_from_banks(tmp_path: Path, capsys: pytest.CaptureFix
     assert main([*given, *more]) == 0
     assert first.read_bytes() != second.read_bytes()
     assert main([*given, "--banks", str(tmp_path), "--out", str(second)]) == 2
-    assert "holds no masks of these images" in " ".join(capsys.readouterr().err.split())
+    assert "holds none of these images under rain" in " ".join(capsys.readouterr().err.split())
 
 
-def test_labels_and_weights_of_cut_crops() -> None:
+def test_labels_of_cut_crops_are_what_the_rain_changed() -> None:
     clear = np.full((64, 64, 3), 100, np.uint8)
-    rainy, opacity = clear.copy(), np.zeros((64, 64), np.float32)
-    opacity[:, 32:] = 1
-    rainy[:32, 32:], rainy[32:, 32:] = 200, 101
-    bank = detector_training.Rained(clear, rainy, opacity)
+    rainy = clear.copy()
+    rainy[:32, 32:], rainy[32:, 32:] = 200, 106
+    bank = detector_training.Rained(clear, rainy)
     pool = detector_training.cut(lambda _: bank, 1, (64, 64), np.random.default_rng(0))
-    label, weight = pool.labels[0, 0], pool.weights[0, 0]
+    label = pool.labels[0, 0]
     if not label[0, -1]:  # the crop came mirrored
-        label, weight = label.flip(-1), weight.flip(-1)
-    assert label.sum() == 128
-    assert label[:, 8:].all()
-    assert (weight[:, :8] == 1).all()
-    assert (weight[:8, 8:] == 3).all()  # 100 levels off: the most
-    assert (weight[8:, 8:] == torch.tensor(0.1)).all()  # one level off: the least
+        label = label.flip(-1)
+    assert (label[:, :8] == 0).all()
+    assert (label[:8, 8:] == 1).all()  # 100 levels off: all that counts
+    assert torch.allclose(label[8:, 8:], torch.tensor((6 / detector_training.HURTS) ** 2))
 
 
 def test_the_packages_detector_knows_rain_from_none(shared_data: Path) -> None:

@@ -335,3 +335,25 @@ def test_opencv_reads_what_it_is_given(tmp_path: Path) -> None:
     image = cv2.imread(str(tmp_path / "photo.png"))
     assert image is not None
     assert Restorer(saved(tmp_path / "own"), skip=False)(image).shape == image.shape
+
+
+def test_cells_around_are_looked_at_where_that_is_cheap() -> None:
+    image = with_drop(picture(0, (160, 160)), 70, 70)
+    found = {}
+    for around in (0.0, 0.3, 9.0):
+        made = by_cells(around=around)
+        few, many = np.zeros((10, 10), bool), np.zeros((10, 10), bool)
+        few[4, 4], many[::3, ::3] = True, True
+        wide = np.zeros((10, 10), bool)
+        wide[3:6, 3:6] = True
+        assert np.array_equal(made.looked_at(few), wide if around else few)
+        assert made.looked_at(many).all() == (around == 9)
+        found[around] = made.restored(image)
+    assert np.array_equal(found[0.3].image, found[9.0].image)
+    assert not np.array_equal(found[0.0].image, found[9.0].image)
+    for restored in found.values():
+        assert restored.computed == found[0.0].computed
+        changed = (restored.image != image).any(-1)
+        assert changed[64:80, 64:80].any()
+        changed[64:80, 64:80] = False
+        assert not changed.any()
