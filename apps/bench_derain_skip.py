@@ -32,7 +32,7 @@ TENTH = 0.1
 """Share of a frame that drops cover in the middle cases."""
 HEAVY = 0.6
 VISIBLE = 0.15
-MANY = 6
+MANY = 4
 SECONDS = 8
 """Frames of the videos."""
 PAIRS = ((0.02, 0.05), (0.05, 0.1), (0.05, 0.15), (0.05, 0.2), (0.05, 0.3), (0.05, 0.4), (0.1, 0.3))
