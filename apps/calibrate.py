@@ -127,7 +127,8 @@ def examine(options: Options, captures: Captures, clock: Clock) -> Findings:
         observations, solution, expected_baseline=expected / 1000 if expected else None, cov=covariance, shape=shape
     )
     clock("uncertainty and checks")
-    mixture = mixed_captures.examine(observations, solution, captures.sought and captures.sought.through)
+    through = None if captures.sought is None else captures.sought.through
+    mixture = mixed_captures.examine(observations, solution, through)
     verdict = checks.Verdict((*verdict.findings, *mixed_captures.doubts(mixture)))
     clock("one rig, one state")
     hypotheses: tuple[Hypothesis, ...] = ()

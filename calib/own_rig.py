@@ -89,9 +89,10 @@ def _linear(problem: Problem) -> tuple[Array, Array, Array, Array]:
         good = left <= np.maximum(STANDS_OUT * 1.4826 * scale, FLOOR_PX)[:, None]
         good &= good[:, np.arange(good.shape[1]) ^ 1]  # x and y of a corner stay together
         kept = there & good
-    N = np.swapaxes(J, 1, 2) @ J
+    N: Array = np.asarray(np.swapaxes(J, 1, 2) @ J)
     free, own = N[:, 6:, 6:], N[:, 6:, :6]
-    weight = free - own @ np.linalg.pinv(N[:, :6, :6], rcond=1e-12, hermitian=True) @ np.swapaxes(own, 1, 2)
+    across: Array = np.asarray(np.linalg.pinv(N[:, :6, :6], rcond=1e-12, hermitian=True) @ np.swapaxes(own, 1, 2))
+    weight: Array = np.asarray(free - own @ across)
     corners = kept.sum(1) / 2
     square = np.nansum(np.where(kept, left, 0) ** 2, axis=1)
     weight[2 * corners <= ENOUGH] = 0
