@@ -70,7 +70,7 @@ def test_thirteen_pairs_solve_in_half_a_second() -> None:
     seen = synthetic.observe(synthetic.rig(), synthetic.poses(13, 1, board), board, noise=0.1)
     seconds = []
     for _ in range(3):
-        started = time.perf_counter()
+        started = time.process_time()  # of the processor: others that work beside do not count
         solve(seen, "LENSMODEL_OPENCV8")
-        seconds.append(time.perf_counter() - started)
+        seconds.append(time.process_time() - started)
     assert min(seconds) < 1.0  # 0.2 s on a machine that is not shared; the goal is 0.5
