@@ -14,7 +14,7 @@ from rainstereo.apps.bench_harness import Measurement, Outcome, Spread, Stage, T
 from rainstereo.apps.canvas import to_svg
 from rainstereo.apps.report import Cell, Report, Tile, quantity
 from rainstereo.apps.run_record import Record, versions, write_atomically
-from rainstereo.apps.tradeoff import error_against_time
+from rainstereo.apps.tradeoff import error_against_time, times_alone
 
 
 @dataclass(frozen=True)
@@ -93,18 +93,21 @@ def rows(outcome: Outcome) -> list[tuple[str, ...]]:
 
 
 def plot(outcome: Outcome) -> Figure:
-    """Error against time, in milliseconds."""
-    seconds = [m.seconds for m in outcome.measurements]
-    return error_against_time(
-        [m.name for m in outcome.measurements],
-        [1e3 * s.median for s in seconds],
-        [m.error for m in outcome.measurements],
-        [1e3 * s.low for s in seconds],
-        [1e3 * s.high for s in seconds],
-        [m.ours for m in outcome.measurements],
-        unit=outcome.work.unit,
-        time_unit="ms",
+    """Error against time, in milliseconds; times alone where no variant has an error, or none is wrong at all."""
+    names, seconds = [m.name for m in outcome.measurements], [m.seconds for m in outcome.measurements]
+    ours = [m.ours for m in outcome.measurements]
+    times, low, high = (
+        [1e3 * value for value in each] for each in zip(*((s.median, s.low, s.high) for s in seconds), strict=True)
     )
+    if not _errs(outcome):
+        return times_alone(names, times, low, high, ours, time_unit="ms")
+    errors = [m.error for m in outcome.measurements]
+    return error_against_time(names, times, errors, low, high, ours, unit=outcome.work.unit, time_unit="ms")
+
+
+def _errs(outcome: Outcome) -> bool:
+    """Whether any variant is known to be wrong by anything."""
+    return any(math.isfinite(m.error) and m.error > 0 for m in outcome.measurements)
 
 
 def judged(outcomes: tuple[Outcome, ...]) -> Iterator[tuple[Outcome, Target, Spread, bool]]:
@@ -158,7 +161,8 @@ def page(stage: Stage, outcomes: tuple[Outcome, ...], machine: Mapping[str, obje
     for outcome in outcomes:
         work = outcome.work
         report.section(work.title, work.what)
-        report.figure(plot(outcome), f"Error against time. Blue: rainstereo; gray: others. Error: {work.error_name}.")
+        what = "Error against time" if _errs(outcome) else "Times"
+        report.figure(plot(outcome), f"{what}. Blue: rainstereo; gray: others. Error: {work.error_name}.")
         strong = [i for i, m in enumerate(outcome.measurements) if m.name == work.champion]
         table: list[tuple[Cell, ...]] = [tuple(row) for row in rows(outcome)]
         columns = header(outcome)
@@ -191,7 +195,8 @@ def markdown(stage: Stage, outcomes: tuple[Outcome, ...], machine: Mapping[str, 
         lines.append("")
     for outcome in outcomes:
         work = outcome.work
-        lines += [f"## {work.title}", "", work.what, "", f"![error against time]({picture_name(stage, outcome)})", ""]
+        shown = "error against time" if _errs(outcome) else "times"
+        lines += [f"## {work.title}", "", work.what, "", f"![{shown}]({picture_name(stage, outcome)})", ""]
         columns = header(outcome)
         lines += [f"| {' | '.join(columns)} |", f"| --- |{' ---: |' * (len(columns) - 2)} --- |"]
         lines += [f"| {' | '.join(_cell(cell) for cell in row)} |" for row in rows(outcome)]

@@ -80,6 +80,29 @@ def error_against_time(
     return figure
 
 
+@styled
+def times_alone(
+    names: Sequence[str],
+    times: npt.ArrayLike,
+    low: npt.ArrayLike,
+    high: npt.ArrayLike,
+    ours: npt.ArrayLike,
+    time_unit: str = "s",
+) -> Figure:
+    """Run times, one under the other, where there is no error to set against them; arguments as above, (N,) each."""
+    time, left, right = (np.asarray(values, float).reshape(-1) for values in (times, low, high))
+    same_length("names", names, "times", time)
+    figure, axes = sheet(7.6, 1.1 + 0.42 * len(names))
+    axes.set(xscale="log", xlabel=f"time, {time_unit} (bar: quartiles)")
+    for row, mine in enumerate(np.asarray(ours, bool).reshape(-1).tolist()):
+        Mark(names[row], time[row], float(row), left[row], right[row], mine, False).draw(axes)
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    _set_limits(axes.set_xlim, [*left, *right])
+    _name_ticks(axes.xaxis)
+    return figure
+
+
 class Mark(NamedTuple):
     """One way to do the work, in the units of the axes; `off` marks an error below the axis."""
 

@@ -192,6 +192,17 @@ def test_pages_say_where_we_win_and_where_we_lose() -> None:
     assert "Where rainstereo loses" in page
 
 
+@pytest.mark.parametrize("nothing", [0.0, math.nan])
+def test_where_there_is_no_error_times_are_shown_alone(nothing: float) -> None:
+    same = outcome({"ours": [1.0, 1.1], "peer": [2.0, 2.1]}, {"ours": nothing, "peer": nothing})
+    (axes,) = bench_page.plot(same).axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["ours", "peer"]
+    assert [float(line.get_xdata()[0]) for line in axes.lines] == pytest.approx([1050.0, 2050.0])
+    assert "![times](" in bench_page.markdown(STAGE, (same,), machine(), "x")
+    wrong = outcome({"ours": [1.0], "peer": [2.0]}, {"ours": nothing, "peer": 0.5})
+    assert bench_page.plot(wrong).axes[0].get_ylabel().startswith("error")
+
+
 def test_a_busy_machine_is_owned_up_to() -> None:
     quiet = outcome({"ours": [1.0], "peer": [1.0]}, {"ours": 0, "peer": 0})
     assert "busy" not in bench_page.markdown(STAGE, (quiet,), {**machine(), "load": 0.0}, "x")

@@ -20,7 +20,7 @@ from rainstereo.apps import figures, overlays
 from rainstereo.apps.canvas import INK, to_inline_svg, to_png, to_svg
 from rainstereo.apps.report import Report, Tile, quantity
 from rainstereo.apps.run_record import RESERVED, Record, jsonable, write_atomically, write_json
-from rainstereo.apps.tradeoff import error_against_time
+from rainstereo.apps.tradeoff import error_against_time, times_alone
 
 VOID = {"meta", "link", "img", "input", "br", "hr"}
 
@@ -275,6 +275,7 @@ MAKERS = {
     "trade": lambda: error_against_time(["a", "b", "c"], [1, 2, 3], [0, 1e-9, np.nan], [0.9, 2, 3], [1.1, 2, 3]),
     "no trade": lambda: error_against_time(["a"], [np.nan], [1]),
     "same trade": lambda: error_against_time(["a", "b"], [1, 1], [1e-3, 1e-3]),
+    "times": lambda: times_alone(["a", "b"], [1, 3], [0.9, 2], [1.1, 4], [True, False]),
     "grid": lambda: figures.image_grid([picture(), picture(1, (20, 30))], ["one", "two"]),
 }
 
