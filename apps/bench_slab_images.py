@@ -14,6 +14,8 @@ from rainstereo.apps.slab_study import BOARD, SD, Setting, gathered
 from rainstereo.calib.solve import Solution
 
 RIGS = 3
+TILTS = {15: ("known", "paired"), 45: ("known",)}
+"""Degrees that the chamber is pitched by, and the ways to calibrate there."""
 GRAY_LEVELS = (1.0, 14.0)
 """Noise of a good sensor, and one at which corners err about as much as the stage `slab` has them err."""
 
@@ -25,10 +27,10 @@ def build(seed: int, quick: bool) -> Stage:
         "calibration through panels from pictures",
         "The stage `slab` adds noise to exact corners. Here boards are drawn through the chamber, photographed by a "
         "sensor with noise, and their corners detected: whatever a detector does wrong takes part.",
-        (_images(seed, quick),),
+        tuple(_images(seed, quick, tilt) for tilt in TILTS),
         {
-            "rig": "two OPENCV8 cameras of 1280x960, f about 1200 px, 29 mm apart, behind two 4 mm panels pitched "
-            "by 15 degrees; each rig and its boards drawn anew",
+            "rig": "two OPENCV8 cameras of 1280x960, f about 1200 px, 29 mm apart, behind two 4 mm panels; each rig "
+            "and its boards drawn anew",
             "board": BOARD.spec,
             "sensor": "blur 0.5 px, 8 bits, ink 28 and paper 214 of 255, darker towards the corners",
             "description": f"standard deviations {1e3 * SD.thickness[0]:g} mm a panel, {np.degrees(SD.tilt):g} "
@@ -39,13 +41,14 @@ def build(seed: int, quick: bool) -> Stage:
     )
 
 
-def _images(seed: int, quick: bool) -> Work:
-    """From pictures: known panels and paired captures, at two noises of the sensor."""
+def _images(seed: int, quick: bool, tilt: int) -> Work:
+    """From pictures: known panels, and paired captures, at two noises of the sensor."""
     frames, seeds = (4, range(seed, seed + 1)) if quick else (60, range(seed, seed + RIGS))
-    settings = {
-        "known": Setting("known", 15, 2 * frames if quick else frames),
-        "paired": Setting("paired", 15, frames if quick else frames // 2, 0.25, 0.6),
+    both = {
+        "known": Setting("known", tilt, 2 * frames if quick else frames),
+        "paired": Setting("paired", tilt, frames if quick else frames // 2, 0.25, 0.6),
     }
+    settings = {mode: both[mode] for mode in TILTS[tilt]}
 
     @cache
     def taken(mode: str) -> list[tuple[Photographed, ...]]:
@@ -74,11 +77,13 @@ def _images(seed: int, quick: bool) -> Work:
         noise = f"{GRAY_LEVELS[level]:g} of 255 gray levels of noise in each pixel"
         return Variant(f"{mode}, {('sharp', 'noisy')[level]}", run, error, True, noise, also=also)
 
+    poses = {"known": "{} poses behind the chamber", "paired": "{} without and with it"}
+    told_poses = ", or ".join(poses[mode].format(setting.frames) for mode, setting in settings.items())
     return Work(
-        "images",
-        "From pictures of boards",
+        f"in-{tilt}",
+        f"From pictures of boards, panels pitched by {tilt} degrees",
         f"Boards are drawn through the chamber, photographed and detected; {len(seeds)} rigs, each with its own poses: "
-        f"{settings['known'].frames} behind the chamber, or {settings['paired'].frames} without and with it.",
+        f"{told_poses}.",
         tuple(variant(mode, level) for mode in settings for level in (0, 1)),
         "known, noisy",
         "px",

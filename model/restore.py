@@ -132,7 +132,8 @@ class Restorer:
                 found[i] = self.restored(image)
                 continue
             cells = self.marked(image)
-            if cells.any() and self.plan(cells, image) == [_whole(image)]:
+            plan = self.plan(cells, image) if cells.any() else []
+            if isinstance(plan, list) and plan == [_whole(image)]:
                 whole.setdefault((*image.shape, image.dtype.itemsize), []).append((i, cells))
             else:
                 found[i] = self.with_cells(image, cells)

@@ -214,6 +214,21 @@ def test_batches_equal_single_images() -> None:
     assert made.many([]) == []
 
 
+def test_batches_of_frames_with_few_drops_equal_single_images() -> None:
+    """With a network that computes cells of its own size, which the package's does."""
+    config = replace(CONFIG, padding="zeros", normalisation="none", patch=4)
+    made = Restorer(network=network(config), detector=RedDetector())
+    few = [with_drop(picture(i, (192, 256)), 80, 90) for i in range(2)]
+    everywhere = picture(3, (192, 256))
+    everywhere[::16, ::16] = (0, 0, 255)
+    images = [*few, everywhere, picture(4, (192, 256))]
+    alone = [made.restored(image) for image in images]
+    assert 0 < alone[0].computed < alone[2].computed == 1
+    for found, single in zip(made.many(images), alone, strict=True):
+        assert np.abs(found.image.astype(int) - single.image).max() <= 1
+        assert (found.marked, found.computed) == (single.marked, single.computed)
+
+
 def test_precision_and_names() -> None:
     image = picture()
     half = restorer()
