@@ -93,10 +93,14 @@ class _Residual(nn.Module):
             group_norm(channels_out),
         )
         same = stride == 1 and channels_in == channels_out
-        self.past = nn.Identity() if same else nn.Conv2d(channels_in, channels_out, 1, stride)
+        # pixels are left out before, not by a stride: in torch 2.13 on the processor the gradient of a strided 1x1
+        # convolution of few channels in channels-last order writes beyond its memory
+        self.stride = stride
+        self.past = nn.Identity() if same else nn.Conv2d(channels_in, channels_out, 1)
 
     def forward(self, features: Tensor) -> Tensor:
-        return functional.relu(self.past(features) + self.change(features))
+        beside = features[..., :: self.stride, :: self.stride]
+        return functional.relu(self.past(beside) + self.change(features))
 
 
 def _sized(features: Tensor, like: Tensor) -> Tensor:

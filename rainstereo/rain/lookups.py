@@ -303,7 +303,7 @@ class Paste:
 def _packed(values: Image) -> Any:
     """Words, (N,), of up to three channels of bytes, (N, C)."""
     words: Any = np.empty(len(values), dtype=np.uint64)
-    if values.shape[1] < 3 or not LITTLE:
+    if values.shape[1] < 3 or not len(values) or not LITTLE:
         _pack(values, words)
         return words
     four = cv2.cvtColor(values[None], cv2.COLOR_BGR2BGRA).view(np.uint32).ravel()

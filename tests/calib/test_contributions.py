@@ -19,6 +19,7 @@ from rainstereo.calib import (
 from rainstereo.calib import mrcal_versions as versions
 from rainstereo.calib.observations import Observations
 from rainstereo.calib.prior import Prior
+from rainstereo.calib.problem_rig import rig_of
 from rainstereo.calib.slab import Slab
 from rainstereo.calib.solve import Solution, solve
 from rainstereo.calib.sought import Sought
@@ -131,7 +132,7 @@ def again(start: Solution, seen: Observations, known: Chamber) -> Solution:
     corners = np.stack([seen.xy(role) for role in ROLES])[camera, frame]
     problem.observations[..., 2] = np.isfinite(corners[..., 0])
     through_acrylic.refine(problem, np.nan_to_num(corners), known)
-    return replace(start, problem=problem, rig=consistency._rig(problem, known))
+    return replace(start, problem=problem, rig=rig_of(problem, known))
 
 
 def pair(rig: Rig, depth: float) -> Array:
