@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from skimage import data
 
 from rainstereo import Camera, Chamber, Panel
 from rainstereo.droplet import SphericalCap
@@ -13,18 +12,15 @@ from rainstereo.patch import folded
 from rainstereo.rain import lookups
 from rainstereo.rain.pursuit import MOST, SHRUNK, Pursuit
 from rainstereo.rain.pyramid import copies, copy_starts, half, sizes, starts
-from rainstereo.rain.quadtree import UNIT, Quadtree, Taps, steps_between
+from rainstereo.rain.quadtree import UNIT, Quadtree, steps_between
 from rainstereo.rain.render import Renderer
 from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.trace import Fate, clear_transmittance, trace
+from tests.core.texel_sums import photograph, summed
 
 SIZE = (400, 300)
 SIDE = 8
 WORTH = 0.04
-
-
-def photograph() -> np.ndarray:
-    return np.asarray(cv2.resize(data.astronaut(), SIZE, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def texels(image: np.ndarray) -> np.ndarray:
@@ -37,13 +33,6 @@ def texels(image: np.ndarray) -> np.ndarray:
     wide = [(p[:-1, :w:2] + p[:-1, 1:w:2]) / 2 for p, (_, w) in zip(padded, even, strict=True)]
     tall = [(p[:h:2, :-1] + p[1:h:2, :-1]) / 2 for p, (h, _) in zip(padded, even, strict=True)]
     return np.concatenate([part.reshape(-1, 3) for part in (*levels, *wide, *tall)])
-
-
-def summed(taps: Taps, image: np.ndarray) -> np.ndarray:
-    values = taps.weights[:, None] / UNIT * texels(image)[taps.texels]
-    total = np.zeros((len(taps.counts), 3))
-    np.add.at(total, np.repeat(np.arange(len(taps.counts)), taps.counts), values)
-    return total
 
 
 def pixels(seed: int, count: int, widest: float, side: int = SIDE) -> tuple[np.ndarray, np.ndarray]:
@@ -70,20 +59,20 @@ def rms(difference: np.ndarray) -> float:
 
 def test_fewer_texels_than_the_tree_for_less_error():
     """The reference: rays four times as dense along each side."""
-    image = photograph()
+    image = photograph(SIZE)
     x, y = pixels(1, 300, 60)
     truth = cv2.remap(image, *pixels(1, 300, 60, 4 * SIDE), cv2.INTER_LINEAR).mean(0)
     ours, tree = pursuit().taps(x, y, even(x)), pursuit().tree.taps(x, y, even(x))
-    assert rms(summed(ours, image) - truth) < rms(summed(tree, image) - truth) < 3
+    assert rms(summed(ours, texels(image)) - truth) < rms(summed(tree, texels(image)) - truth) < 3
     assert len(ours.texels) < 0.6 * len(tree.texels)
 
 
 def test_worth_trades_texels_for_error():
-    image, (x, y) = photograph(), pixels(2, 200, 60)
+    image, (x, y) = photograph(SIZE), pixels(2, 200, 60)
     truth = cv2.remap(image, x, y, cv2.INTER_LINEAR).mean(0)
     found = [pursuit(worth).taps(x, y, even(x)) for worth in (0.01, 0.3, 4.0)]
     counts = [len(taps.texels) for taps in found]
-    errors = [rms(summed(taps, image) - truth) for taps in found]
+    errors = [rms(summed(taps, texels(image)) - truth) for taps in found]
     assert counts == sorted(counts, reverse=True)
     assert errors == sorted(errors)
     assert counts[0] > 3 * counts[-1]
@@ -159,7 +148,7 @@ def test_copies_follow_the_levels():
     assert copy_starts(SIZE)[: len(starts(SIZE))] == starts(SIZE)
     wide, tall = (next(c for c in copies((101, 61)) if (c.across, c.down) == shape) for shape in ((2, 1), (1, 2)))
     assert (wide.width, wide.height, tall.width, tall.height) == (26, 31, 51, 16)
-    assert texels(photograph()).shape == (copy_starts(SIZE)[-1], 3)
+    assert texels(photograph(SIZE)).shape == (copy_starts(SIZE)[-1], 3)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3])
@@ -198,7 +187,7 @@ DROPS = [
 
 def test_plans_that_last_are_within_a_gray_level_of_many_rays():
     """Some pixels in drops against 24 x 24 exact rays each."""
-    image = photograph().astype(np.uint8)
+    image = photograph(SIZE).astype(np.uint8)
     plan, default = (Renderer(CAMERA, PANE, lasting=lasting).plan(DROPS) for lasting in (True, False))
     found, other = plan.render(image), default.render(image)
     for name in ("opacity", "displacement", "unknown", "drop_mask"):
@@ -219,7 +208,7 @@ def test_plans_that_last_are_within_a_gray_level_of_many_rays():
 
 
 def test_plans_that_last_do_not_depend_on_the_other_drops():
-    renderer, image = Renderer(CAMERA, PANE, lasting=True), photograph().astype(np.uint8)
+    renderer, image = Renderer(CAMERA, PANE, lasting=True), photograph(SIZE).astype(np.uint8)
     sequence = renderer.sequence()
     frames = [each.apply(image) for each in (renderer.plan(DROPS), renderer.plan(DROPS[::-1]), sequence.plan(DROPS))]
     np.testing.assert_array_equal(frames[0], frames[1])
@@ -231,7 +220,7 @@ def test_plans_that_last_do_not_depend_on_the_other_drops():
 
 def test_plans_that_last_for_other_types():
     """The same in 16 bits, in floating point and in gray."""
-    image = photograph().astype(np.uint8)
+    image = photograph(SIZE).astype(np.uint8)
     plan = Renderer(CAMERA, PANE, lasting=True).plan(DROPS)
     bytes_ = plan.apply(image).astype(float)
     assert np.abs(plan.apply(image.astype(np.uint16) * 257) / 257 - bytes_).max() <= 1.5

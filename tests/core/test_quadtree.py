@@ -7,17 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from skimage import data
 
 from rainstereo.rain.pyramid import half, sizes, starts
-from rainstereo.rain.quadtree import UNIT, Quadtree, Taps
+from rainstereo.rain.quadtree import UNIT, Quadtree
+from tests.core.texel_sums import photograph, summed
 
 SIZE = (200, 150)
 SIDE = 8
-
-
-def photograph() -> np.ndarray:
-    return np.asarray(cv2.resize(data.astronaut(), SIZE, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def texels(image: np.ndarray) -> np.ndarray:
@@ -25,14 +21,6 @@ def texels(image: np.ndarray) -> np.ndarray:
     for _ in sizes(SIZE)[1:]:
         levels.append(half(levels[-1]))
     return np.concatenate([level.reshape(-1, 3) for level in levels])
-
-
-def summed(taps: Taps, image: np.ndarray) -> np.ndarray:
-    """Values, (M, 3), one tap after the other."""
-    values = taps.weights[:, None] / UNIT * texels(image)[taps.texels]
-    total = np.zeros((len(taps.counts), 3))
-    np.add.at(total, np.repeat(np.arange(len(taps.counts)), taps.counts), values)
-    return total
 
 
 def spread(centre: np.ndarray, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -57,20 +45,20 @@ def test_small_pixels_are_their_rays():
     """In the image itself each ray has its four texels: nothing but rounding is lost."""
     x, y = pixels(1, 50, 5)
     taps = Quadtree(SIZE, 33, 0.0).taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
-    image = photograph()
+    image = photograph(SIZE)
     # OpenCV looks at steps of 1/32 pixel; weights are rounded to 1/4096
-    np.testing.assert_allclose(summed(taps, image), looked_up(image, x, y), atol=0.7)
+    np.testing.assert_allclose(summed(taps, texels(image)), looked_up(image, x, y), atol=0.7)
     assert not taps.error.any()
 
 
 def test_worth_trades_texels_for_error():
     x, y = pixels(2, 300, 40)
-    share, image = np.full(x.shape, 1 / SIDE**2, dtype=np.float32), photograph()
+    share, image = np.full(x.shape, 1 / SIDE**2, dtype=np.float32), photograph(SIZE)
     counts, errors, told = [], [], []
     for worth in (1e-4, 1e-2, 1.0, 100.0):
         taps = Quadtree(SIZE, 17, worth).taps(x, y, share)
         counts.append(len(taps.texels))
-        errors.append(float(np.sqrt(np.mean((summed(taps, image) - looked_up(image, x, y)) ** 2))))
+        errors.append(float(np.sqrt(np.mean((summed(taps, texels(image)) - looked_up(image, x, y)) ** 2))))
         told.append(float(np.sqrt(taps.error.mean())))
     assert counts == sorted(counts, reverse=True)
     assert errors == sorted(errors)
@@ -86,7 +74,7 @@ def test_places_far_apart_are_not_averaged_over_what_lies_between():
     x, y = spread(np.array([[30.0, 70.0]]), np.array([[8.0, 0.0]]), np.array([[0.0, 8.0]]))
     x[:, 0].reshape(SIDE, SIDE)[:, 4:] += 140
     taps = Quadtree(SIZE, 17, 0.02).taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
-    assert summed(taps, image).max() < 1
+    assert summed(taps, texels(image)).max() < 1
 
 
 @settings(max_examples=40, deadline=None)
@@ -104,7 +92,7 @@ def test_any_rays(seed, count, widest, gain, extent, worth):
     assert taps.texels.min(initial=0) >= 0
     assert taps.texels.max(initial=0) < starts(SIZE)[-1]
     flat = np.ones((SIZE[1], SIZE[0], 3), dtype=np.float32)
-    np.testing.assert_allclose(summed(taps, flat)[:, 0], weights.sum(0), atol=1 / UNIT)
+    np.testing.assert_allclose(summed(taps, texels(flat))[:, 0], weights.sum(0), atol=1 / UNIT)
     alone = tree.taps(x[:, :1], y[:, :1], weights[:, :1])
     np.testing.assert_array_equal(taps.texels[: alone.counts[0]], alone.texels)
     np.testing.assert_array_equal(taps.weights[: alone.counts[0]], alone.weights)
