@@ -54,7 +54,7 @@ def build(seed: int, quick: bool) -> Stage:
 
 def _derained(module: Generator, full: Image, scattered: Image, quick: bool) -> list[Work]:
     """At the stage's size, and at twice that."""
-    papers = partial(copy.deepcopy, bench_derain_cuda.papers())
+    papers = partial(copy.deepcopy, bench_derain_cuda.paper_network())
     shipped, found = partial(copy.deepcopy, module), []
     for scale in (1, 2):
         size = scale * full.shape[1], scale * full.shape[0]

@@ -42,7 +42,7 @@ def works(
     height, width = frames[0].shape[:2]
     size = f"{width} x {height}"
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)
-    tell = "From uint8 frames in the computer's memory to uint8 frames there" + f", on {where}."
+    tell = f"From uint8 frames in the computer's memory to uint8 frames there, on {where}."
     wide = _work(
         f"paper-{width}", f"The paper's network on a GPU, {size}", papers, frames,
         tell + " base_channels 64, 255 GMACs at 640 x 480, random weights; nothing is skipped.", device,
@@ -96,7 +96,7 @@ def _work(
     )  # fmt: skip
 
 
-def papers() -> Generator:
+def paper_network() -> Generator:
     """The paper's network, with random weights."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)

@@ -306,7 +306,7 @@ def _pasted(out: Image, restored: Image, part: Rect, cells: Mask) -> Image:
 def leaves_out() -> str:
     """Changes when anything does that decides, by default, which cells are left as they are."""
     weights = detector.shipped().read_bytes()
-    settings = THRESHOLD, CERTAIN, CELLS_HALO, PARTS_HALO, RAMP, BY_CELLS, LOOKING, AROUND, WHOLE, CALL
+    settings = THRESHOLD, CERTAIN, UNIT, CELLS_HALO, PARTS_HALO, RAMP, BY_CELLS, LOOKING, AROUND, WHOLE, CALL
     return hashlib.sha256(weights + repr(settings).encode()).hexdigest()
 
 
