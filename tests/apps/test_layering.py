@@ -21,7 +21,9 @@ FOLDERS = {
 MAY_IMPORT = {"rainstereo": {"rainstereo"}, "calib": {"rainstereo", "calib"}, "model": {"rainstereo", "model"},
               "apps": {"rainstereo", "calib", "model", "apps"}}  # fmt: skip
 CORE_NEEDS = {"rainstereo", "numpy", "cv2", "scipy"}
+COMPILED_NEEDS = CORE_NEEDS | {"numba"}
 HARDWARE_NEEDS = CORE_NEEDS | {"serial", "imagecodecs", "gi", "pypylon"}
+MORE_NEEDS = {"rainstereo/compiled/": COMPILED_NEEDS, "rainstereo/hardware/": HARDWARE_NEEDS}
 MRCAL_HERE = {"calib/mrcal_versions.py": "anywhere", "rainstereo/camera.py": "lazily"}
 SAYS_NOTHING = {"utils", "util", "helpers", "helper", "common", "misc"}
 
@@ -96,7 +98,7 @@ def _complaint(folder: str, where: str, name: str, at_import_time: bool) -> str 
     target = floor(name)
     if target is not None and target not in MAY_IMPORT[folder]:
         return f"imports {name}; {folder} may not know of {target}"
-    needs = HARDWARE_NEEDS if where.startswith("rainstereo/hardware/") else CORE_NEEDS
+    needs = next((needs for start, needs in MORE_NEEDS.items() if where.startswith(start)), CORE_NEEDS)
     if folder == "rainstereo" and top not in needs and top not in sys.stdlib_module_names:
         return f"imports {name}; the core needs only {', '.join(sorted(needs))}"
     return None
@@ -126,6 +128,7 @@ BREACHES = {
     "mrcal elsewhere in calib": ("calib/solve.py", "from mrcal import optimize", "only calib/mrcal_versions.py"),
     "mrcal at import time in camera": ("rainstereo/camera.py", "import mrcal", "only calib/mrcal_versions.py"),
     "serial in the core": ("rainstereo/a.py", "import serial", "the core needs only"),
+    "numba in the core": ("rainstereo/rain/a.py", "def f():\n    import numba", "the core needs only"),
     "torch in hardware": ("rainstereo/hardware/a.py", "import torch", "the core needs only"),
     "utils": ("calib/utils.py", "x = 1", "a name that says nothing"),
     "common folder": ("apps/common/a.py", "x = 1", "a name that says nothing"),
@@ -177,7 +180,7 @@ def run_without(blocked: tuple[str, ...], body: str) -> subprocess.CompletedProc
 
 def test_core_works_without_mrcal_torch_and_the_rest(record_property: Callable[[str, object], None]) -> None:
     done = run_without(
-        ("mrcal", "torch", "kornia", "skimage", "matplotlib", "tyro", "rich", "serial"),
+        ("mrcal", "torch", "kornia", "skimage", "matplotlib", "tyro", "rich", "serial", "numba"),
         """
         started = time.perf_counter()
         from rainstereo import Camera, Chamber, Panel

@@ -1,0 +1,23 @@
+"""How loops are compiled: once for each machine and kind of argument, and kept on disk beside the module."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+
+Loop = TypeVar("Loop", bound=Callable[..., Any])
+
+
+def compiled(loop: Loop) -> Loop:
+    """The loop in machine code: it releases the lock, checks no index and divides as IEEE 754 says.
+
+    Where neither the package's folder nor the user's cache can be written to, it is compiled anew in every process.
+    """
+    settings: dict[str, Any] = {"nogil": True, "boundscheck": False, "error_model": "numpy"}
+    try:
+        found = numba.njit(cache=True, **settings)(loop)
+    except RuntimeError:  # numba: no place for the cache
+        found = numba.njit(**settings)(loop)
+    return cast(Loop, found)
