@@ -145,14 +145,19 @@ class CellGenerator:
         return drawn.view(len(windows), out, out, -1).permute(0, 3, 1, 2)
 
     def _raised(self, layer: nn.ConvTranspose2d, features: Tensor, places: _Places) -> Tensor:
-        """A 3 x 3 transposed convolution of stride 2: 2 x 2 places beside each other make the 2 x 2 of the first."""
+        """A 3 x 3 transposed convolution of stride 2: 2 x 2 places beside each other make the 2 x 2 of the first, the
+        n-th of which sees no more than the first n of them."""
         count, channels, size = features.shape[:3]
         matrix, bias = self._matrix(layer, _transposed(layer), 2, features)
         wide = places.windows(features, 0, 1).permute(0, 2, 3, 1)
         four = [wide[:, i : i + size, j : j + size] for i in (0, 1) for j in (0, 1)]
-        drawn = functional.linear(torch.cat(four, 3).view(-1, 4 * channels), matrix, bias)
-        tiled = drawn.view(count, size, size, 2, 2, -1).transpose(2, 3)
-        return tiled.reshape(count, 2 * size, 2 * size, -1).permute(0, 3, 1, 2)
+        seen, made = torch.cat(four, 3).view(-1, 4 * channels), layer.out_channels
+        found = features.new_empty(count, size, 2, size, 2, made)
+        for number in range(4):
+            rows, columns = slice(number * made, (number + 1) * made), slice((number + 1) * channels)
+            drawn = functional.linear(seen[:, columns], matrix[rows, columns], None if bias is None else bias[rows])
+            found[:, :, number // 2, :, number % 2] = drawn.view(count, size, size, made)
+        return found.view(count, 2 * size, 2 * size, made).permute(0, 3, 1, 2)
 
     def _matrix(
         self, layer: nn.Conv2d | nn.ConvTranspose2d, run: Callable[[Tensor], Tensor], side: int, like: Tensor
