@@ -35,7 +35,7 @@ VISIBLE = 0.15
 MANY = 4
 SECONDS = 8
 """Frames of the videos."""
-PAIRS = ((0.03, 0.1), (0.03, 0.2), (0.05, 0.2), (0.05, 0.3), (0.05, 0.5), (0.1, 0.6))
+PAIRS = ((0.02, 0.06), (0.03, 0.1), (0.03, 0.15), (0.04, 0.25), (0.05, 0.3), (0.1, 0.6))
 """Thresholds that are compared: of cells that are restored if computed, and of squares that are computed."""
 
 
