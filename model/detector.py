@@ -33,7 +33,7 @@ OWN = 8
 FACTORS = (1, 2, 4)
 ROWS = 180
 """Rows that the averaged image has at least, if the image has them."""
-THRESHOLD, CERTAIN, EVIDENT = 0.03, 0.2, 1.0
+THRESHOLD, CERTAIN, EVIDENT = 0.03, 0.2, 0.8
 """See `Detector`. Chosen on frames that nothing was trained on, for the time that they take and what they leave in the
 rain; `rainstereo bench derain` compares them with others."""
 SQUARE = 4

@@ -187,7 +187,8 @@ def test_the_packages_detector_knows_rain_from_none(shared_data: Path) -> None:
     found = Detector.shipped()
     clear = [imagefile.read(path) for path in sorted((shared_data / "camvid11_480x360/val").iterdir())[::8]]
     marked = [found.cells(image).mean() for image in clear]
-    assert np.mean(marked) < 0.05
+    assert np.mean(marked) < 0.01
+    assert np.mean([share == 0 for share in marked]) > 0.5  # these come back bit for bit
     wet = sorted((shared_data / "raindrop/robotcar_rainy").glob("left_*.png"))
     dry = sorted((shared_data / "raindrop/robotcar_rainy").glob("right_*.png"))
     for rainy, clear_path in zip(wet, dry, strict=True):
