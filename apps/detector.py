@@ -30,7 +30,7 @@ MOST_BYTES = 200_000
 class Options:
     """Train the drop detector of `rainstereo derain` on clear images, on which drops are rendered.
 
-    Writes NAME.safetensors and its card NAME.toml. About 15 minutes on a processor's core for the defaults. The same
+    Writes NAME.safetensors and its card NAME.toml. About 25 minutes on a processor's core for the defaults. The same
     seed gives the same weights on one machine.
     """
 
