@@ -32,9 +32,9 @@ from rainstereo.model.detector import CELL, CERTAIN, EVIDENT, THRESHOLD, UNIT, D
 from rainstereo.model.image_batch import INPUT
 from rainstereo.model.networks import Network, OnnxNetwork, TorchNetwork, pick_device
 from rainstereo.model.pixels import check, from_batch, from_rgb, to_batch, to_rgb
-from rainstereo.model.tiles import Grid, Rect, Rows, coarser, covering, ramped, strips
+from rainstereo.model.tiles import Grid, Rect, Rows, coarser, covering, mixed, ramped, strips
 from rainstereo.model.whole_frames import WholeFrames
-from rainstereo.types import Array, Image, Mask
+from rainstereo.types import Image, Mask
 
 Backend = Literal["torch", "onnx"]
 Checkpoint = str | os.PathLike[str]
@@ -234,13 +234,8 @@ class Restorer:
         like = given[:1, : made.cell, : made.cell]  # whose kind and channels count
         restored = from_batch(made(to_batch(given, self.network.device), where, looked), like)
         weight = patches(ramped(cells, CELL, (image.shape[0], image.shape[1]), RAMP), where, made.cell, 0)
-        before = patches(out, where, made.cell, 0)
-        mixed = restored.astype(np.float32)
-        mixed -= before
-        flat = mixed.reshape(*weight.shape[:2], -1)  # numpy multiplies long rows faster than colours
-        flat *= np.repeat(weight, 3, 2) if out.ndim == 3 else weight
-        mixed += before
-        found = np.rint(mixed, out=mixed).astype(out.dtype)
+        tall = [each.reshape(-1, *each.shape[2:]) for each in (restored, patches(out, where, made.cell, 0), weight)]
+        found = mixed(*tall).reshape(restored.shape)
         for square, row, column in zip(found, *np.nonzero(where), strict=True):
             part = out[row * made.cell : (row + 1) * made.cell, column * made.cell : (column + 1) * made.cell]
             part[...] = square[: part.shape[0], : part.shape[1]]
@@ -295,14 +290,8 @@ def _pasted(out: Image, restored: Image, part: Rect, cells: Mask) -> Image:
     if cells.all():
         out[part.slices] = restored
         return out
-    weight: Array = ramped(cells, CELL, (part.bottom - part.top, part.right - part.left), RAMP)
-    given = out[part.slices]
-    mixed = restored.astype(np.float32)
-    mixed -= given
-    flat = mixed.reshape(len(mixed), -1)  # numpy multiplies long rows faster than colours
-    flat *= np.repeat(weight, 3, 1) if out.ndim == 3 else weight
-    mixed += given
-    out[part.slices] = np.rint(mixed, out=mixed)
+    weight = ramped(cells, CELL, (part.bottom - part.top, part.right - part.left), RAMP)
+    out[part.slices] = mixed(restored, out[part.slices], weight)
     return out
 
 

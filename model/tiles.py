@@ -113,6 +113,17 @@ def ramped(marked: Mask, cell: int, size: tuple[int, int], ramp: int) -> Array:
     return cast(Array, cv2.LUT(full, weights) if kind == cv2.CV_8U else weights[full])
 
 
+def mixed(restored: Image, given: Image, weight: Array) -> Image:
+    """weight x restored + (1 - weight) x given, (H, W[, 3]) uint8 or uint16; where it is 0 the given bit for bit."""
+    if given.dtype == np.uint8:  # OpenCV's blend, a tenth of the time, rounds as below: it knows bytes only
+        return cast(Image, cv2.blendLinear(restored, given, weight, 1 - weight))
+    change = restored.astype(np.float32)
+    change -= given
+    change *= weight[..., None] if given.ndim == 3 else weight
+    change += given
+    return np.rint(change, out=change).astype(given.dtype)
+
+
 # -- images that are larger than what can be computed at once ----------------------------------------------------------
 
 
