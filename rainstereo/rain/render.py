@@ -17,6 +17,7 @@ import numpy as np
 
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
+from rainstereo.compiled import available
 from rainstereo.droplet import Drop, SphericalCap
 from rainstereo.layer import depth_of
 from rainstereo.patch import BORDERS
@@ -26,10 +27,12 @@ from rainstereo.types import Array, Image, Indices, Mask
 from . import drop_list, linear_light
 from .blurred import BlurredLayer, by_disc
 from .drops import Drops
-from .looks import Looks, PasteLooks
+from .looks import Looks
 from .lookups import Lookups, Paste
 from .minified import Batch, Minifier
+from .moving_caps import CapScene, CapTable, check_places
 from .outlines import Outlines
+from .paste_moving import PasteMoving
 from .rendered import Rendered
 from .single_ray import SingleRay
 from .streaks import Streak
@@ -149,13 +152,41 @@ class Renderer:
         given = np.fromiter(numbers, dtype=np.intp)
         if not self.moving:
             return self._minifier.lookups(self._batches(groups, given))
+        tables, others = list[Any](), list[int]()
+        for panel, some in _by_far_face(groups).items():
+            if panel is None:
+                others += some
+            else:
+                tables += self._of_caps(panel, [groups[i] for i in some], given[some])
+        if others:
+            tables += self._single_ray.tables(self._batches([groups[i] for i in others], given[others]))
+        return tables
+
+    def _of_caps(self, panel: int, groups: Sequence[Group], numbers: Indices) -> list[Any]:
+        """Tables of caps on a panel's far face."""
         caps = [drop for group in groups for drop in group.drops if isinstance(drop, SphericalCap)]
-        places = {(cap.panel, cap.face) for cap in caps}
-        if len(caps) < sum(len(group.drops) for group in groups) or len(places) > 1 or caps[0].face != "far":
-            return self._single_ray.tables(self._batches(groups, given))
-        pixels, which = Outlines.joined([group.outlines for group in groups]).pixels()
-        of_drop = np.repeat(given, [len(group.drops) for group in groups])
-        return self._single_ray.tables_of_caps(caps, pixels, which, of_drop[which])
+        outlines = Outlines.joined([group.outlines for group in groups])
+        of_cap = np.repeat(numbers, [len(group.drops) for group in groups])
+        scene = self._cap_scene(panel)
+        if scene is not None and min(cap.index for cap in caps) >= 1:
+            check_places(caps, self.chamber, self.depth)
+            return [CapTable.of(scene, caps, outlines, of_cap)]
+        pixels, which = outlines.pixels()
+        return self._single_ray.tables_of_caps(caps, pixels, which, of_cap[which])
+
+    def _cap_scene(self, panel: int) -> CapScene | None:
+        """What compiled loops need to draw caps on a panel's far face; None if they cannot."""
+        if not (available() and CapScene.suits(self.camera)):
+            return None
+        if panel not in self._cap_scenes:
+            where = (self.scene_size, self.shift, self.fold, panel)
+            scene = CapScene(self.camera, self.chamber, self.depth, self.tolerance, *where)
+            self._cap_scenes[panel] = scene if scene.lattice.is_whole else None
+        return self._cap_scenes[panel]
+
+    @cached_property
+    def _cap_scenes(self) -> dict[int, CapScene | None]:
+        return {}
 
     def _batches(self, groups: Sequence[Group], numbers: Indices) -> list[Batch]:
         """Caps of a face in one batch if each is alone, in another if not; groups with other drops on their own."""
@@ -241,7 +272,7 @@ class Plan:
 
     renderer: Renderer
     drops: Sequence[Drop]
-    tables: Sequence[Lookups] | Sequence[Looks] = field(repr=False)
+    tables: Sequence[Lookups | Looks | CapTable] = field(repr=False)
     layers: Sequence[BlurredLayer] = field(repr=False)
 
     def apply(self, image: Image) -> Image:
@@ -264,9 +295,9 @@ class Plan:
             layer.paste(scene, out)
 
     @cached_property
-    def _paste_all(self) -> Paste | PasteLooks:
+    def _paste_all(self) -> Paste | PasteMoving:
         if self.renderer.moving:
-            return PasteLooks([table for table in self.tables if isinstance(table, Looks)])
+            return PasteMoving(self.tables)
         tables = [table for table in self.tables if isinstance(table, Lookups)]
         return Paste(tables, self.renderer.scene_size, self.renderer.camera.width)
 
@@ -319,6 +350,16 @@ class Plan:
             rows, columns, unknown = layer.unknown
             found[rows, columns] |= unknown
         return found
+
+
+def _by_far_face(groups: Sequence[Group]) -> dict[int | None, list[int]]:
+    """Numbers of groups of nothing but caps on one panel's far face, by the panel; None: the others."""
+    found: dict[int | None, list[int]] = {}
+    for i, group in enumerate(groups):
+        places = {(drop.panel, drop.face) if isinstance(drop, SphericalCap) else None for drop in group.drops}
+        place = places.pop() if len(places) == 1 else None
+        found.setdefault(place[0] if place is not None and place[1] == "far" else None, []).append(i)
+    return found
 
 
 def _batch(groups: Sequence[Group], numbers: Indices) -> Batch:
