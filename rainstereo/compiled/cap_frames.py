@@ -138,6 +138,7 @@ def record_row(
                 filling, mean,
             )  # fmt: skip
         if not rays[HIDDEN + j] > ZERO:
+            cursor[TAPS] = before
             continue
         if filling:
             row, pixel = cursor[PIXELS], first + lane
