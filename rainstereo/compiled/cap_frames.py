@@ -78,7 +78,7 @@ def frame(
                         taken(tile, t, s, lanes, caps, number, rivals, outline, line, rays)
                     if mode != DRAW:
                         record_row(
-                            mode == FILL, v * width + u1, number, lanes, low, high, tiny, tile, t, s, edge, cap, later,
+                            mode == FILL, v * width + u1, number, lanes, low, high, tiny, hangs, tile, t, s, edge, cap, later,
                             view, side, parts, (scene.shape[1], scene.shape[0]), starts, pitches, inverses, border,
                             shift, grids, counts, rays, at, total, len(words), width, record,
                         )  # fmt: skip
@@ -94,9 +94,8 @@ def frame(
                         if not rays[HIDDEN + j] > ZERO or not (tiny or ZERO < rays[LITS + j] < np.float32(LIT)):
                             continue
                         near = not rays[ROOM + j] > edge
-                        rays[HIDDEN + j] = own_rays(
-                            tile, t, s + np.float32(lane), near, cap, later, view, side, parts, rays
-                        )
+                        share = own_rays(tile, t, s + np.float32(lane), near, cap, later, view, side, parts, rays)
+                        rays[HIDDEN + j] = max(share, rays[HIDDEN + j]) if hangs and not tiny else share
                         total[0] = total[1] = total[2] = ZERO
                         rays_of_words(
                             words, scene, starts, pitches, inverses, last, shift, border, rays, side, parts, total
@@ -107,8 +106,8 @@ def frame(
 
 @compiled
 def record_row(
-    filling: bool, first: int, number: int, lanes: int, low: int, high: int, tiny: bool, tile: Array, t: float,
-    s: float, edge: float, cap: Array, later: Array, view: Array, side: int, parts: Array, size: tuple[int, int],
+    filling: bool, first: int, number: int, lanes: int, low: int, high: int, tiny: bool, hangs: bool, tile: Array,
+    t: float, s: float, edge: float, cap: Array, later: Array, view: Array, side: int, parts: Array, size: tuple[int, int],
     starts: Indices, pitches: Indices, inverses: Array, border: int, shift: tuple[float, float], grids: Array,
     counts: Indices, rays: Array, at: Any, mean: Array, boxes: int, width: int, record: Any,
 ) -> None:  # fmt: skip
@@ -132,7 +131,8 @@ def record_row(
             off = not rays[FAR + j] >= ZERO
         elif (lit > ZERO or tiny) and low <= lane < high:
             near = not rays[ROOM + j] > edge
-            rays[HIDDEN + j] = own_rays(tile, t, s + np.float32(lane), near, cap, later, view, side, parts, rays)
+            share = own_rays(tile, t, s + np.float32(lane), near, cap, later, view, side, parts, rays)
+            rays[HIDDEN + j] = max(share, rays[HIDDEN + j]) if hangs and not tiny else share
             off = record_rays(
                 starts, pitches, inverses, size, shift, border, rays, side, parts, boxes, texels, weights, cursor,
                 filling, mean,

@@ -52,7 +52,7 @@ def fit(nodes: Array, cap: Array, u: int, v: int, reach: int, tile: Array) -> tu
     nodes: (4 + D, h, w) float64. u, v: the tile's middle; reach: pixels from there to its sides.
     """
     most = max(min((nodes.shape[2] - 1) // 2, (nodes.shape[1] - 1) // 2), 1)
-    step = min(max((reach + STEP) // STEP, 1), most)
+    step = min(max(int(0.87 * reach / STEP + 0.5), 1), most)  # about where the error is least
     i = min(max((u + STEP // 2) // STEP, step), nodes.shape[2] - 1 - step)
     j = min(max((v + STEP // 2) // STEP, step), nodes.shape[1] - 1 - step)
     scale = 1.0 / (STEP * step)
@@ -145,6 +145,8 @@ def cross(cap: Array, later: Array, view: Array, rays: Array, low: int, high: in
         rays[KX + j] = kx + bend * px
         rays[KY + j] = ky + bend * py
         rays[KZ + j] = up
+        # beside the contact circle the sphere goes on below the face, for pixels at the edge, unless it hangs over
+        inside = inside if b >= ZERO or room > ZERO else ZERO
         rays[to + GAIN + j] = passed * rays[DIM + j] if inside > ZERO and up > ZERO else ZERO
     for face in range(len(later)):
         thick, q1, q2 = later[face, 0], later[face, 1] * later[face, 1], later[face, 2] * later[face, 2]
