@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from rainstereo.types import Array
-
 from .compile import compiled
 
 FIELD = np.uint64(21)
@@ -20,7 +18,7 @@ LOW = np.uint64(0xFF)
 
 
 @compiled
-def mirrored(j: int, last: int) -> int:
+def mirrored(j: Any, last: Any) -> Any:
     """A number brought between 0 and `last`, reflected once at either end."""
     j = abs(j)
     if j > last:
@@ -65,7 +63,7 @@ def first_boxes(cells: Any, small: Any, large: Any) -> None:
 
 
 @compiled
-def _cell(i: int, count: int) -> int:
+def _cell(i: Any, count: Any) -> Any:
     """A cell's number, reflected at the image's edges."""
     i = -i - 1 if i < 0 else i
     i = 2 * count - 1 - i if i >= count else i

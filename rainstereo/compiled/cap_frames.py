@@ -7,14 +7,33 @@ from typing import Any
 
 import numpy as np
 
-from rainstereo.types import Array, Indices
-
 from .cap_looks import rays_of_words, whole_of_words
 from .cap_rays import BLUE, CAP_SQUARE, GREEN, HALF, HIDDEN, ONE, PLANES, RED, ROOM, ZERO, fit
 from .cap_records import PIXELS, TAPS, record_rays, record_whole
 from .cap_tiles import (
-    AXX, AYY, BXX, BYY, CX, CY, FAR, LIT, LITS, OUT_RADIUS, OUT_RIVALS, TILE, TINY, bounds, hangs_over, move_up,
-    next_span, own_rays, patches, row_of_tile, shares_of_row, taken, widest,
+    AXX,
+    AYY,
+    BXX,
+    BYY,
+    CX,
+    CY,
+    FAR,
+    LIT,
+    LITS,
+    OUT_RADIUS,
+    OUT_RIVALS,
+    TILE,
+    TINY,
+    bounds,
+    hangs_over,
+    move_up,
+    next_span,
+    own_rays,
+    patches,
+    row_of_tile,
+    shares_of_row,
+    taken,
+    widest,
 )  # fmt: skip
 from .compile import compiled
 
@@ -24,8 +43,8 @@ DRAW, COUNT, FILL = 0, 1, 2
 
 @compiled
 def frame(
-    mode: int, out: Any, scene: Any, words: Any, boxes: Any, border: int, shift: tuple[float, float], looks: Any,
-    side: int, parts: Array, nodes: Array, caps: Array, outlines: Array, rivals: Indices, later: Array, view: Array,
+    mode: Any, out: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, looks: Any,
+    side: Any, parts: Any, nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
     record: Any,
 ) -> None:  # fmt: skip
     """Go over the pixels of caps, in the order of the caps.
@@ -56,31 +75,31 @@ def frame(
                 reach = (max(lanes, v2 - v1) + 1) // 2
                 u0, v0 = fit(nodes, cap, u1 + lanes // 2, (v1 + v2) // 2, reach, tile)
                 wide, radius = widest(tile), math.sqrt(cap[CAP_SQUARE])
-                edge, slack = 1.5 * radius * wide + wide * wide, 1.1 * (radius * wide + wide * wide)
+                edge = 1.45 * radius * wide + wide * wide  # of room: a pixel's corner is 0.71 pixels from its middle
                 hangs, tiny = hangs_over(tile, cap, wide, 1.5 * reach), radius < TINY * wide
                 s, known = np.float32(u1) - u0, False
-                following = next_span(tile, np.float32(v1) - v0, s, lanes, cap, slack, line, rays)
+                following = next_span(tile, np.float32(v1) - v0, s, lanes, cap, edge, line, rays)
                 for v in range(v1, v2):
                     low, high = following
                     t = np.float32(v) - v0
                     move_up(rays)
                     following = (0, 0)
                     if v + 1 < v2:
-                        following = next_span(tile, t + ONE, s, lanes, cap, slack, line, rays)
+                        following = next_span(tile, t + ONE, s, lanes, cap, edge, line, rays)
                     if high <= low and not hangs:
                         known = False
                         continue
                     row_of_tile(tile, t, s, not known, (low, high), following, cap, later, view, line, rays)
                     known = low < high
                     patches(rays, low, high, number_of_looks, most, shift, last)
-                    shares_of_row(tile, t, s, lanes, edge, slack, wide, hangs, cap, line, rays)
+                    shares_of_row(tile, t, s, lanes, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
                         taken(tile, t, s, lanes, caps, number, rivals, outline, line, rays)
                     if mode != DRAW:
                         record_row(
-                            mode == FILL, v * width + u1, number, lanes, low, high, tiny, hangs, tile, t, s, edge, cap, later,
-                            view, side, parts, (scene.shape[1], scene.shape[0]), starts, pitches, inverses, border,
-                            shift, grids, counts, rays, at, total, len(words), width, record,
+                            mode == FILL, v * width + u1, number, lanes, low, high, tiny, hangs, tile, t, s, edge, cap,
+                            later, view, side, parts, (scene.shape[1], scene.shape[0]), starts, pitches, inverses,
+                            border, shift, grids, counts, rays, at, total, len(words), width, record,
                         )  # fmt: skip
                         continue
                     nothing_shown(rays)
@@ -106,10 +125,10 @@ def frame(
 
 @compiled
 def record_row(
-    filling: bool, first: int, number: int, lanes: int, low: int, high: int, tiny: bool, hangs: bool, tile: Array,
-    t: float, s: float, edge: float, cap: Array, later: Array, view: Array, side: int, parts: Array, size: tuple[int, int],
-    starts: Indices, pitches: Indices, inverses: Array, border: int, shift: tuple[float, float], grids: Array,
-    counts: Indices, rays: Array, at: Any, mean: Array, boxes: int, width: int, record: Any,
+    filling: bool, first: Any, number: Any, lanes: Any, low: Any, high: Any, tiny: bool, hangs: bool, tile: Any,
+    t: Any, s: Any, edge: Any, cap: Any, later: Any, view: Any, side: Any, parts: Any, size: Any,
+    starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
+    counts: Any, rays: Any, at: Any, mean: Any, boxes: Any, width: Any, record: Any,
 ) -> None:  # fmt: skip
     """Count, or write down, a row's pixels. first: number of the pixel of lane 0. boxes: how many there are."""
     pixels, of_caps, taps, clear, moved, unknown, texels, weights, cursor = record
@@ -150,14 +169,14 @@ def record_row(
 
 
 @compiled
-def nothing_shown(rays: Array) -> None:
+def nothing_shown(rays: Any) -> None:
     """Of a row, to begin with."""
     for j in range(np.uint64(3 * 64)):
         rays[RED + j] = ZERO
 
 
 @compiled
-def write_bytes(out: Any, v: int, u: int, lanes: int, rays: Array) -> None:
+def write_bytes(out: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
     """Mix what a row shows with what is there, where a cap hides it."""
     channels = np.uint64(out.shape[2])
     row, plane = out[v].ravel(), np.uint64(64)

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rainstereo.types import Array, Indices
-
-from .cap_rays import BLUE, STEPS as PATCHES, GAIN, GREEN, HALF, HIDDEN, ONE, RED, SHARE, SUB, Y_, ZERO
+from .cap_rays import BLUE, GAIN, GREEN, HALF, HIDDEN, ONE, RED, SHARE, STEPS, SUB, Y_, ZERO
 from .cap_tiles import ABX, ABY, ACROSS, AREA, AX, AXX, AY, AYY, BX, BXX, BY, BYY, CX, CY, FAR, GAINS, LIT, LITS
 from .compile import compiled, inlined
 
@@ -29,13 +27,15 @@ LIMIT = np.float32(32)  # the same for boxes of 4 pixels: 4 sqrt 2, in the middl
 T_, SS, TT, ST = (np.uint64(64 * i) for i in (1, 2, 3, 4))
 """Parts of a grid of looks: places s along a pixel, t down, s^2 / 2, t^2 / 2 and s t, of up to 64."""
 FARTHEST = np.float32(1e6)  # pixels; what lies beyond is not told apart
-RIGHT, RIGHT_X, RIGHT_Y, DOWN, DOWN_X, DOWN_Y, AREAS = (PATCHES + np.uint64(128 * i) for i in range(7))
+RIGHT, RIGHT_X, RIGHT_Y, DOWN, DOWN_X, DOWN_Y, UP, UP_X, UP_Y, AREAS, NEXT_ROW = (
+    STEPS + np.uint64(128 * i) for i in range(11)
+)
 MOST = 12
 """Looks along a small patch's side."""
 
 
 @inlined
-def folded(at: float, last: float, border: int) -> float:
+def folded(at: Any, last: Any, border: Any) -> Any:
     """A coordinate brought between 0 and `last`, as `patch.folded_along` does."""
     if border == MIRROR:
         at = min(abs(at), FARTHEST)
@@ -47,7 +47,7 @@ def folded(at: float, last: float, border: int) -> float:
 
 
 @inlined
-def size_of(square: float, sizes: int) -> int:
+def size_of(square: Any, sizes: Any) -> Any:
     """The size of boxes for a part of a patch, of this area; -1: the image itself."""
     if not square >= FINEST:
         return -1
@@ -59,7 +59,7 @@ def size_of(square: float, sizes: int) -> int:
 
 
 @inlined
-def pixel_value(scene: Any, x: float, y: float, channel: int) -> float:
+def pixel_value(scene: Any, x: Any, y: Any, channel: Any) -> Any:
     """An image's value, bilinear, at a place inside it."""
     i, j = int(y), int(x)
     v, u = y - np.float32(i), x - np.float32(j)
@@ -70,7 +70,7 @@ def pixel_value(scene: Any, x: float, y: float, channel: int) -> float:
 
 
 @inlined
-def place_on(rays: Array, j: int, s: float, t: float) -> tuple[float, float]:
+def place_on(rays: Any, j: Any, s: Any, t: Any) -> Any:
     """Where a place on a pixel, -1/2 to 1/2 each way, looks."""
     x = rays[CX + j] + s * (rays[AX + j] + HALF * s * rays[AXX + j] + t * rays[ABX + j])
     y = rays[CY + j] + s * (rays[AY + j] + HALF * s * rays[AYY + j] + t * rays[ABY + j])
@@ -78,9 +78,7 @@ def place_on(rays: Array, j: int, s: float, t: float) -> tuple[float, float]:
 
 
 @compiled
-def patch_of_pixels(
-    scene: Any, last: tuple[float, float], border: int, rays: Array, j: int, total: Array
-) -> None:
+def patch_of_pixels(scene: Any, last: Any, border: Any, rays: Any, j: Any, total: Any) -> None:
     """The mean of a small patch, from the image itself; added to `total`, (C,)."""
     ax, ay, bx, by = rays[AX + j], rays[AY + j], rays[BX + j], rays[BY + j]
     across = min(max(int(HALF * min(np.float32(math.sqrt(ax * ax + ay * ay)), np.float32(64))) + 1, 2), MOST)
@@ -97,8 +95,8 @@ def patch_of_pixels(
 
 @inlined
 def places(
-    inverse: float, pitch: int, last: tuple[float, float], border: int, far: bool, rays: Array, j: int, grid: Array,
-    of_grid: int, count: int, at: Any,
+    inverse: Any, pitch: Any, last: Any, border: Any, far: bool, rays: Any, j: Any, grid: Any,
+    of_grid: Any, count: Any, at: Any,
 ) -> None:  # fmt: skip
     """Numbers, among the boxes of a size, of those that a patch looks at, to `at`, (64,) uint32.
 
@@ -129,7 +127,7 @@ def places(
 
 
 @inlined
-def sum_of_words(words: Any, start: int, at: Any, count: int) -> int:
+def sum_of_words(words: Any, start: Any, at: Any, count: Any) -> Any:
     """Of some boxes."""
     first, found = np.uint64(start), np.uint64(0)
     for look in range(np.uint64(count)):
@@ -138,7 +136,7 @@ def sum_of_words(words: Any, start: int, at: Any, count: int) -> int:
 
 
 @inlined
-def unpack(word: int, total: Array, weight: float) -> None:
+def unpack(word: Any, total: Any, weight: Any) -> None:
     """Add a sum of words to the sums of channels."""
     total[0] += weight * np.float32(np.int64(word & MASK))
     total[1] += weight * np.float32(np.int64((word >> FIELD) & MASK))
@@ -147,8 +145,8 @@ def unpack(word: int, total: Array, weight: float) -> None:
 
 @compiled
 def whole_of_words(
-    words: Any, scene: Any, starts: Indices, pitches: Indices, inverses: Array, last: tuple[float, float], border: int,
-    grids: Array, counts: Indices, low: int, high: int, rays: Array, total: Array, at: Any,
+    words: Any, scene: Any, starts: Any, pitches: Any, inverses: Any, last: Any, border: Any,
+    grids: Any, counts: Any, low: Any, high: Any, rays: Any, total: Any, at: Any,
 ) -> None:  # fmt: skip
     """What those pixels of a row show all of whose rays are lit, lanes low to before high: planes RED, ..."""
     for lane in range(low, high):
@@ -181,38 +179,48 @@ def whole_of_words(
 
 
 @inlined
-def areas(rays: Array, side: int, parts: Array) -> None:
-    """Areas of the boxes for a pixel's own rays, to the plane `AREAS`: what the shorter steps to lit neighbours span."""
-    two, width = np.uint64(128), np.uint64(side)
+def areas(rays: Any, side: Any, parts: Any) -> None:
+    """Areas of the boxes for a pixel's own rays, to `AREAS`: what the shorter steps to lit neighbours span."""
+    right, below, width = np.uint64(128), np.uint64(192), np.uint64(side)
     lanes, one = np.uint64((side * side + 7) // 8 * 8), np.uint64(1)
     far, quarter = np.float32(1e30), np.float32(0.25)
+    for j in range(lanes + width):  # the same rays once more, a row on, so that distances between planes are fixed
+        rays[NEXT_ROW + j] = rays[SUB + j + width]
+        rays[NEXT_ROW + Y_ + j] = rays[SUB + Y_ + j + width]
+        rays[NEXT_ROW + GAIN + j] = rays[SUB + GAIN + j + width]
     for j in range(lanes):
-        k = SUB + j
-        lit = rays[k + GAIN] > ZERO
-        dx, dy = rays[k + one] - rays[k], rays[k + Y_ + one] - rays[k + Y_]
-        there = rays[k + GAIN + one] * parts[two + j] > ZERO
-        rays[RIGHT + j + one] = dx * dx + dy * dy if lit and there else far
-        rays[RIGHT_X + j + one] = dx
-        rays[RIGHT_Y + j + one] = dy
-        dx, dy = rays[k + width] - rays[k], rays[k + Y_ + width] - rays[k + Y_]
-        there = rays[k + GAIN + width] * parts[two + np.uint64(64) + j] > ZERO
-        rays[DOWN + j + width] = dx * dx + dy * dy if lit and there else far
-        rays[DOWN_X + j + width] = dx
-        rays[DOWN_Y + j + width] = dy
+        lit, x, y = rays[SUB + GAIN + j], rays[SUB + j], rays[SUB + Y_ + j]
+        dx, dy = rays[SUB + one + j] - x, rays[SUB + Y_ + one + j] - y
+        there = rays[SUB + GAIN + one + j] * parts[right + j]
+        there = there if there < lit else lit
+        rays[RIGHT + one + j] = dx * dx + dy * dy if there > ZERO else far
+        rays[RIGHT_X + one + j] = dx
+        rays[RIGHT_Y + one + j] = dy
+        dx, dy = rays[NEXT_ROW + j] - x, rays[NEXT_ROW + Y_ + j] - y
+        there = rays[NEXT_ROW + GAIN + j] * parts[below + j]
+        there = there if there < lit else lit
+        rays[DOWN + j] = dx * dx + dy * dy if there > ZERO else far
+        rays[DOWN_X + j] = dx
+        rays[DOWN_Y + j] = dy
     rays[RIGHT] = far
     for j in range(width):
-        rays[DOWN + j] = far
+        rays[UP + j] = far
     for j in range(lanes):
-        a, b = rays[RIGHT + j], rays[RIGHT + j + one]
+        rays[UP + j + width] = rays[DOWN + j]
+        rays[UP_X + j + width] = rays[DOWN_X + j]
+        rays[UP_Y + j + width] = rays[DOWN_Y + j]
+    for j in range(lanes):
+        a, b = rays[RIGHT + j], rays[RIGHT + one + j]
         long = a if a < b else b
-        ax = rays[RIGHT_X + j] if a < b else rays[RIGHT_X + j + one]
-        ay = rays[RIGHT_Y + j] if a < b else rays[RIGHT_Y + j + one]
-        c, d = rays[DOWN + j], rays[DOWN + j + width]
+        ax = rays[RIGHT_X + j] if a < b else rays[RIGHT_X + one + j]
+        ay = rays[RIGHT_Y + j] if a < b else rays[RIGHT_Y + one + j]
+        c, d = rays[UP + j], rays[DOWN + j]
         wide = c if c < d else d
-        bx = rays[DOWN_X + j] if c < d else rays[DOWN_X + j + width]
-        by = rays[DOWN_Y + j] if c < d else rays[DOWN_Y + j + width]
+        bx = rays[UP_X + j] if c < d else rays[DOWN_X + j]
+        by = rays[UP_Y + j] if c < d else rays[DOWN_Y + j]
         area = abs(ax * by - ay * bx)
-        area = area if long < far and wide < far else ZERO
+        most = long if long > wide else wide
+        area = area if most < far else ZERO
         long = long if long < far else ZERO
         wide = wide if wide < far else ZERO
         long = quarter * (long if long > wide else wide)
@@ -221,8 +229,8 @@ def areas(rays: Array, side: int, parts: Array) -> None:
 
 @compiled
 def rays_of_words(
-    words: Any, scene: Any, starts: Indices, pitches: Indices, inverses: Array, last: tuple[float, float],
-    shift: tuple[float, float], border: int, rays: Array, side: int, parts: Array, total: Array,
+    words: Any, scene: Any, starts: Any, pitches: Any, inverses: Any, last: Any,
+    shift: Any, border: Any, rays: Any, side: Any, parts: Any, total: Any,
 ) -> None:  # fmt: skip
     """Add what a pixel's own rays show, each with its gain and share, over their number.
 

@@ -11,10 +11,9 @@ All numbers about a tile stand in one array, in planes of 64: so the compiler se
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-
-from rainstereo.types import Array
 
 from .compile import inlined
 
@@ -26,8 +25,8 @@ PATCH = np.uint64(64 * 26)
 HIDDEN, RED, GREEN, BLUE = (np.uint64(64 * i) for i in (43, 44, 45, 46))
 """Of a row: the share of each pixel that a cap hides, and what it shows there."""
 STEPS = np.uint64(64 * 47)
-"""From a pixel's own rays to their neighbours: seven pairs of planes."""
-PLANES = 61
+"""From a pixel's own rays to their neighbours: pairs of planes."""
+PLANES = 73
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
@@ -46,7 +45,7 @@ X_NODE, Y_NODE, KX_NODE, KY_NODE, DIM_NODE = range(5)
 
 
 @inlined
-def fit(nodes: Array, cap: Array, u: int, v: int, reach: int, tile: Array) -> tuple[float, float]:
+def fit(nodes: Any, cap: Any, u: Any, v: Any, reach: Any, tile: Any) -> Any:
     """Polynomials of x, y, kx, ky and dimming over a tile, (5, 3, 3) float32, and the pixel that they are about.
 
     nodes: (4 + D, h, w) float64. u, v: the tile's middle; reach: pixels from there to its sides.
@@ -76,7 +75,7 @@ def fit(nodes: Array, cap: Array, u: int, v: int, reach: int, tile: Array) -> tu
 
 
 @inlined
-def of_row(tile: Array, t: float, line: Array) -> None:
+def of_row(tile: Any, t: Any, line: Any) -> None:
     """The polynomials, (15,), of a row, t pixels from that which a tile's are about."""
     for plane in range(5):
         for power in range(3):
@@ -84,7 +83,7 @@ def of_row(tile: Array, t: float, line: Array) -> None:
 
 
 @inlined
-def take_up(line: Array, s: float, low: int, high: int, rays: Array) -> None:
+def take_up(line: Any, s: Any, low: Any, high: Any, rays: Any) -> None:
     """Rays of lanes low to before high, s + lane pixels along a row."""
     x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
     a0, a1, a2, b0, b1, b2 = line[6], line[7], line[8], line[9], line[10], line[11]
@@ -99,7 +98,7 @@ def take_up(line: Array, s: float, low: int, high: int, rays: Array) -> None:
 
 
 @inlined
-def room_of_row(line: Array, s: float, lanes: int, square: float, rays: Array) -> None:
+def room_of_row(line: Any, s: Any, lanes: Any, square: Any, rays: Any) -> None:
     """Contact radius squared less the square of the distance from the centre, of a row's rays on the face."""
     x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
     for j in range(np.uint64(lanes)):
@@ -109,7 +108,7 @@ def room_of_row(line: Array, s: float, lanes: int, square: float, rays: Array) -
 
 
 @inlined
-def cross(cap: Array, later: Array, view: Array, rays: Array, low: int, high: int, to: int) -> None:
+def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: Any) -> None:
     """Rays that have been taken up, through the cap, the rest of the chamber and to the scene; written from `to` on.
 
     The gain is 0 where no light comes through. later: (F, 3) float32, thickness before a face and the indices
@@ -167,7 +166,7 @@ def cross(cap: Array, later: Array, view: Array, rays: Array, low: int, high: in
 
 
 @inlined
-def _project(cx: float, cy: float, view: Array, rays: Array, first: int, last: int, to: int) -> None:
+def _project(cx: Any, cy: Any, view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
     """Where the camera sees what the rays meet at the scene's depth."""
     m0, m1, m2, m3, m4, m5, m6, m7, m8 = view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8]
     u0, v0, end, inverse = view[VIEW_C], view[VIEW_C + 1], view[VIEW_Z], view[VIEW_INVERSE]
@@ -189,7 +188,7 @@ def _project(cx: float, cy: float, view: Array, rays: Array, first: int, last: i
 
 
 @inlined
-def _distort(view: Array, rays: Array, first: int, last: int, to: int) -> None:
+def _distort(view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
     """The lens's distortion of places; what lies beyond the radius where it folds back goes to that radius."""
     u0, v0, fold = view[VIEW_C], view[VIEW_C + 1], view[VIEW_FOLD]
     fx, fy = view[VIEW_LENS], view[VIEW_LENS + 1]

@@ -6,20 +6,25 @@ from typing import Any
 
 import numpy as np
 
-from rainstereo.types import Array, Indices
-
 from .cap_looks import (
-    AREAS, FINEST, MOST, WIDER, areas, folded, place_on, places, size_of,
+    AREAS,
+    MOST,
+    WIDER,
+    areas,
+    folded,
+    place_on,
+    places,
+    size_of,
 )  # fmt: skip
 from .cap_rays import GAIN, HALF, HIDDEN, ONE, SHARE, SUB, Y_, ZERO
-from .cap_tiles import ACROSS, AREA, AX, AXX, AY, AYY, BX, BXX, BY, BYY, CX, CY, FAR, GAINS, LIT, LITS
+from .cap_tiles import ACROSS, AREA, AX, AY, BX, BY, FAR, GAINS
 from .compile import compiled, inlined
 
 PIXELS, TAPS = 0, 1  # counters
 
 
 @inlined
-def _tap(texels: Any, weights: Array, cursor: Indices, filling: bool, texel: int, weight: float) -> None:
+def _tap(texels: Any, weights: Any, cursor: Any, filling: bool, texel: Any, weight: Any) -> None:
     if filling:
         texels[cursor[TAPS]] = texel
         weights[cursor[TAPS]] = weight
@@ -28,8 +33,8 @@ def _tap(texels: Any, weights: Array, cursor: Indices, filling: bool, texel: int
 
 @inlined
 def _bilinear(
-    texels: Any, weights: Array, cursor: Indices, filling: bool, first: int, size: tuple[int, int], x: float, y: float,
-    weight: float,
+    texels: Any, weights: Any, cursor: Any, filling: bool, first: Any, size: Any, x: Any, y: Any,
+    weight: Any,
 ) -> None:  # fmt: skip
     """The four pixels about a place in the image, whose pixels are numbered from `first` on."""
     i, j = int(y), int(x)
@@ -42,8 +47,8 @@ def _bilinear(
 
 @compiled
 def record_whole(
-    starts: Indices, pitches: Indices, inverses: Array, size: tuple[int, int], border: int, grids: Array,
-    counts: Indices, rays: Array, lane: int, first: int, at: Any, texels: Any, weights: Array, cursor: Indices,
+    starts: Any, pitches: Any, inverses: Any, size: Any, border: Any, grids: Any,
+    counts: Any, rays: Any, lane: Any, first: Any, at: Any, texels: Any, weights: Any, cursor: Any,
     filling: bool,
 ) -> None:  # fmt: skip
     """The taps of a pixel all of whose rays are lit. first: number of the image's first pixel among the texels."""
@@ -74,9 +79,9 @@ def record_whole(
 
 @compiled
 def record_rays(
-    starts: Indices, pitches: Indices, inverses: Array, size: tuple[int, int], shift: tuple[float, float], border: int,
-    rays: Array, side: int, parts: Array, first: int, texels: Any, weights: Array, cursor: Indices, filling: bool,
-    mean: Array,
+    starts: Any, pitches: Any, inverses: Any, size: Any, shift: Any, border: Any,
+    rays: Any, side: Any, parts: Any, first: Any, texels: Any, weights: Any, cursor: Any, filling: bool,
+    mean: Any,
 ) -> bool:  # fmt: skip
     """The taps of a pixel with rays of its own; the mean place of those that are lit; whether one is off the image."""
     areas(rays, side, parts)

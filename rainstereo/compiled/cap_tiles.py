@@ -8,14 +8,42 @@ exact for a straight line.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
-from rainstereo.types import Array, Indices
-
 from .cap_rays import (
-    ABOVE, BELOW, CAP_CURVATURE, CAP_DEPTH, CAP_SQUARE, CAP_X, CAP_Y, DIM, FOUR, FREE, GAIN, HALF, HIDDEN, KX, KY, NEXT, ONE, OWN,
-    PATCH, PX, PY, ROOM, SHARE, SIDES, SUB, Y_, ZERO, cross, of_row, room_of_row, take_up,
+    ABOVE,
+    BELOW,
+    CAP_CURVATURE,
+    CAP_DEPTH,
+    CAP_SQUARE,
+    CAP_X,
+    CAP_Y,
+    DIM,
+    FOUR,
+    FREE,
+    GAIN,
+    HALF,
+    HIDDEN,
+    KX,
+    KY,
+    NEXT,
+    ONE,
+    OWN,
+    PATCH,
+    PX,
+    PY,
+    ROOM,
+    SHARE,
+    SIDES,
+    SUB,
+    Y_,
+    ZERO,
+    cross,
+    of_row,
+    room_of_row,
+    take_up,
 )  # fmt: skip
 from .compile import compiled, inlined
 
@@ -31,12 +59,12 @@ CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, AREA, ACROSS, FAR, 
     PATCH + np.uint64(64 * i) for i in range(17)
 )  # fmt: skip
 """Planes of patches: where a pixel's middle looks; how that changes along x (A) and y (B), twice along each, and along
-both; mean gain; area, square pixels; looks along x; pixels between what it shows and the scene's edge, at least; how many
-rays are lit, less a little where one beside a corner is not."""
+both; mean gain; area, square pixels; looks along x; pixels between what it shows and the scene's edge, at least; how
+many rays are lit, less a little where one beside a corner is not."""
 
 
 @inlined
-def bounds(outline: Array, width: int, height: int) -> tuple[int, int, int, int]:
+def bounds(outline: Any, width: Any, height: Any) -> Any:
     """Columns and rows of the image, firsts and those after the last, that an outline touches."""
     x, y, reach = outline[OUT_X], outline[OUT_Y], min(outline[OUT_RADIUS], 1e9)
     left = int(max(math.ceil(max(x - reach, -1.0)), 0))
@@ -47,14 +75,15 @@ def bounds(outline: Array, width: int, height: int) -> tuple[int, int, int, int]
 
 
 @inlined
-def widest(tile: Array) -> float:
-    """How far apart the rays of neighbouring pixels meet the face, metres, at most (Frobenius)."""
+def widest(tile: Any) -> Any:
+    """How far apart rays that are a pixel apart meet the face, metres, at most: the larger singular value."""
     xu, xv, yu, yv = tile[0, 0, 1], tile[0, 1, 0], tile[1, 0, 1], tile[1, 1, 0]
-    return 1.1 * math.sqrt(xu * xu + xv * xv + yu * yu + yv * yv)
+    total, area = xu * xu + xv * xv + yu * yu + yv * yv, 2 * (xu * yv - xv * yu)
+    return 1.02 * math.sqrt(0.5 * (total + math.sqrt(max(total * total - area * area, 0.0))))
 
 
 @inlined
-def hangs_over(tile: Array, cap: Array, wide: float, reach: float) -> bool:
+def hangs_over(tile: Any, cap: Any, wide: Any, reach: Any) -> Any:
     """Whether rays beside a cap may run into its side."""
     kx = abs(tile[2, 0, 0]) + reach * (abs(tile[2, 0, 1]) + abs(tile[2, 1, 0]))
     ky = abs(tile[3, 0, 0]) + reach * (abs(tile[3, 0, 1]) + abs(tile[3, 1, 0]))
@@ -64,9 +93,7 @@ def hangs_over(tile: Array, cap: Array, wide: float, reach: float) -> bool:
 
 
 @compiled
-def next_span(
-    tile: Array, t: float, s: float, lanes: int, cap: Array, slack: float, line: Array, rays: Array
-) -> tuple[int, int]:
+def next_span(tile: Any, t: Any, s: Any, lanes: Any, cap: Any, slack: Any, line: Any, rays: Any) -> Any:
     """Fill the plane of room of a row, and say between which lanes its rays meet the contact circle, or nearly."""
     of_row(tile, t, line)
     room_of_row(line, s, (lanes + 7) // 8 * 8, np.float32(cap[CAP_SQUARE]), rays)
@@ -80,8 +107,8 @@ def next_span(
 
 @compiled
 def trace_lanes(
-    tile: Array, t: float, s: float, low: int, high: int, cap: Array, later: Array, view: Array, line: Array,
-    rays: Array, to: int,
+    tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, later: Any, view: Any, line: Any,
+    rays: Any, to: Any,
 ) -> None:  # fmt: skip
     """Rays of a row, t and s pixels from the tile's own, to planes from `to` on; for whole vectors of lanes."""
     of_row(tile, t, line)
@@ -91,9 +118,7 @@ def trace_lanes(
 
 
 @compiled
-def patches(
-    rays: Array, low: int, high: int, looks: int, most: int, shift: tuple[float, float], last: tuple[float, float]
-) -> None:
+def patches(rays: Any, low: Any, high: Any, looks: Any, most: Any, shift: Any, last: Any) -> None:
     """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel."""
     quarter, eighth, sixth = np.float32(0.25), np.float32(0.125), np.float32(1 / 6)
     one, two = np.uint64(1), np.uint64(2)
@@ -157,8 +182,8 @@ def patches(
 
 @compiled
 def row_of_tile(
-    tile: Array, t: float, s: float, is_first: bool, span: tuple[int, int], following: tuple[int, int], cap: Array,
-    later: Array, view: Array, line: Array, rays: Array,
+    tile: Any, t: Any, s: Any, is_first: bool, span: Any, following: Any, cap: Any,
+    later: Any, view: Any, line: Any, rays: Any,
 ) -> None:  # fmt: skip
     """Trace a row of pixels between the lanes of its span, and what is below, of its own and of the following span.
 
@@ -177,7 +202,7 @@ def row_of_tile(
 
 
 @compiled
-def move_up(rays: Array) -> None:
+def move_up(rays: Any) -> None:
     """What was below a row is above the next, and what was next to come is at hand."""
     for j in range(np.uint64(3 * 64)):
         rays[ABOVE + j] = rays[BELOW + j]
@@ -189,7 +214,7 @@ def move_up(rays: Array) -> None:
 
 
 @inlined
-def beside_line(nx: float, ny: float, distance: float) -> float:
+def beside_line(nx: Any, ny: Any, distance: Any) -> Any:
     """Share of a unit square within `distance` along the unit normal nx, ny from its middle."""
     a, b = max(abs(nx), abs(ny)), min(abs(nx), abs(ny))
     far = abs(distance)
@@ -201,7 +226,7 @@ def beside_line(nx: float, ny: float, distance: float) -> float:
 
 
 @inlined
-def contact_share(px: float, py: float, radius: float, xu: float, xv: float, yu: float, yv: float) -> float:
+def contact_share(px: Any, py: Any, radius: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
     """Share of a pixel inside the contact circle; xu, ...: metres on the face a pixel."""
     r = np.float32(math.sqrt(px * px + py * py))
     if r < np.float32(1e-3) * radius:
@@ -212,9 +237,7 @@ def contact_share(px: float, py: float, radius: float, xu: float, xv: float, yu:
 
 
 @compiled
-def side_share(
-    px: float, py: float, kx: float, ky: float, radius: float, depth: float, xu: float, xv: float, yu: float, yv: float
-) -> float:
+def side_share(px: Any, py: Any, kx: Any, ky: Any, radius: Any, depth: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
     """Share of a pixel that a cap hides by its base or by its side, which rays beside it meet from the air."""
     kz = np.float32(math.sqrt(max(ONE - kx * kx - ky * ky, ZERO)))
     across = np.float32(math.sqrt(HALF * (xu * xu + xv * xv + yu * yu + yv * yv)))  # metres a pixel
@@ -244,18 +267,16 @@ def side_share(
 
 
 @inlined
-def share_of(
-    tile: Array, t: float, s: float, room: float, edge: float, slack: float, hangs: bool, cap: Array
-) -> float:
-    """Share of a pixel that a cap hides. edge, slack: room beyond which a pixel is surely inside, or outside."""
+def share_of(tile: Any, t: Any, s: Any, room: Any, edge: Any, hangs: bool, cap: Any) -> Any:
+    """Share of a pixel that a cap hides. edge: room beyond which a pixel is surely inside, or, negative, outside."""
     share = ONE
     if not room > edge:
-        if not hangs and not room > -slack:
+        if not hangs and not room > -edge:
             return ZERO
         radius = np.float32(math.sqrt(cap[CAP_SQUARE]))
         px, py = _value(tile, 0, t, s), _value(tile, 1, t, s)
         xu, xv, yu, yv = _along(tile, 0, t, s), _down(tile, 0, t, s), _along(tile, 1, t, s), _down(tile, 1, t, s)
-        share = contact_share(px, py, radius, xu, xv, yu, yv) if room > -slack else ZERO
+        share = contact_share(px, py, radius, xu, xv, yu, yv) if room > -edge else ZERO
         if hangs and share < ONE:
             kx, ky, depth = _value(tile, 2, t, s), _value(tile, 3, t, s), np.float32(cap[CAP_DEPTH])
             kz = np.float32(math.sqrt(max(ONE - kx * kx - ky * ky, ZERO)))
@@ -269,8 +290,8 @@ def share_of(
 
 @compiled
 def shares_of_row(
-    tile: Array, t: float, s: float, lanes: int, edge: float, slack: float, wide: float, hangs: bool, cap: Array,
-    line: Array, rays: Array,
+    tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, hangs: bool, cap: Any,
+    line: Any, rays: Any,
 ) -> None:  # fmt: skip
     """Fill the plane `HIDDEN`: how much of each pixel of a row the cap hides."""
     for j in range(np.uint64(lanes)):
@@ -287,12 +308,12 @@ def shares_of_row(
     near = np.float32(2) * wide
     for j in range(np.uint64(lanes)):
         room = rays[ROOM + j]
-        if not room > edge and (room > -slack or (hangs and rays[FREE + j] < near)):
-            rays[HIDDEN + j] = share_of(tile, t, s + np.float32(np.int32(j)), room, edge, slack, hangs, cap)
+        if not room > edge and (room > -edge or (hangs and rays[FREE + j] < near)):
+            rays[HIDDEN + j] = share_of(tile, t, s + np.float32(np.int32(j)), room, edge, hangs, cap)
 
 
 @inlined
-def _value(tile: Array, plane: int, t: float, s: float) -> float:
+def _value(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     a = tile[plane, 0, 0] + t * (tile[plane, 1, 0] + t * tile[plane, 2, 0])
     b = tile[plane, 0, 1] + t * (tile[plane, 1, 1] + t * tile[plane, 2, 1])
     c = tile[plane, 0, 2] + t * (tile[plane, 1, 2] + t * tile[plane, 2, 2])
@@ -300,14 +321,14 @@ def _value(tile: Array, plane: int, t: float, s: float) -> float:
 
 
 @inlined
-def _along(tile: Array, plane: int, t: float, s: float) -> float:
+def _along(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     b = tile[plane, 0, 1] + t * (tile[plane, 1, 1] + t * tile[plane, 2, 1])
     c = tile[plane, 0, 2] + t * (tile[plane, 1, 2] + t * tile[plane, 2, 2])
     return b + (s + s) * c
 
 
 @inlined
-def _down(tile: Array, plane: int, t: float, s: float) -> float:
+def _down(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     b = tile[plane, 1, 0] + s * (tile[plane, 1, 1] + s * tile[plane, 1, 2])
     c = tile[plane, 2, 0] + s * (tile[plane, 2, 1] + s * tile[plane, 2, 2])
     return b + (t + t) * c
@@ -315,8 +336,8 @@ def _down(tile: Array, plane: int, t: float, s: float) -> float:
 
 @compiled
 def taken(
-    tile: Array, t: float, s: float, lanes: int, caps: Array, number: int, rivals: Indices, outline: Array, line: Array,
-    rays: Array,
+    tile: Any, t: Any, s: Any, lanes: Any, caps: Any, number: Any, rivals: Any, outline: Any, line: Any,
+    rays: Any,
 ) -> None:  # fmt: skip
     """Give up the pixels of a row where another cap has more room: nothing of them is hidden by this one."""
     of_row(tile, t, line)
@@ -335,7 +356,7 @@ def taken(
 
 
 @inlined
-def _comes_before(caps: Array, one: int, other: int) -> bool:
+def _comes_before(caps: Any, one: Any, other: Any) -> Any:
     """Which of two caps has what both have as much room for, whatever their order; of equal ones the first."""
     before = one < other
     for column in (CAP_Y, CAP_X, CAP_CURVATURE, CAP_SQUARE):
@@ -349,9 +370,9 @@ def _comes_before(caps: Array, one: int, other: int) -> bool:
 
 @compiled
 def own_rays(
-    tile: Array, t: float, s: float, near: bool, cap: Array, later: Array, view: Array, side: int, parts: Array,
-    rays: Array,
-) -> float:  # fmt: skip
+    tile: Any, t: Any, s: Any, near: bool, cap: Any, later: Any, view: Any, side: Any, parts: Any,
+    rays: Any,
+) -> Any:  # fmt: skip
     """side x side rays of one pixel to the planes `SUB`, and each one's part's share in the contact circle to `SHARE`.
 
     near: whether the contact line may cross the pixel. parts: places on the pixel, see `rays_of_words`. Returns the

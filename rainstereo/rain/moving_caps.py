@@ -36,6 +36,7 @@ FINE, COARSE = (16, 4), (9, 3)
 """Looks at what a pixel shows, and rays along the side of one at an edge."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
 LANES = 64
+FEW = 400  # caps, up to which all pairs are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +105,18 @@ class CapScene:
     def lattice(self) -> FaceLattice:
         """Of the far face."""
         return FaceLattice.of(self.camera, self.chamber, self.panel, self.depth)
+
+    def nodes(self, indices: tuple[float, ...]) -> Array:
+        """The lattice, and how drops of each index dim."""
+        if indices not in self._nodes:
+            self._nodes.clear()
+            dimming = [self.lattice.dimming(index)[None] for index in indices]
+            self._nodes[indices] = np.concatenate([self.lattice.nodes, *dimming])
+        return self._nodes[indices]
+
+    @cached_property
+    def _nodes(self) -> dict[tuple[float, ...], Array]:
+        return {}
 
     @cached_property
     def boxes(self) -> Boxes:
@@ -203,11 +216,10 @@ class CapTable:
     @cached_property
     def nodes(self) -> Array:
         """The lattice, and how drops of each index dim."""
-        lattice = self.scene.lattice
-        return np.concatenate([lattice.nodes, *(lattice.dimming(float(n))[None] for n in self._indices)])
+        return self.scene.nodes(tuple(self._indices.tolist()))
 
     @cached_property
-    def _indices(self) -> Array:
+    def _indices(self) -> Any:
         return np.unique(self.caps[:, 4])
 
     @cached_property
@@ -226,9 +238,17 @@ class CapTable:
     def _rivals(self) -> tuple[Indices, Indices]:
         x, y, radius = self.circles.T
         shown = np.flatnonzero(radius > 0)
-        one, other = touching(x[shown], y[shown], radius[shown])
-        one, other = shown[np.concatenate([one, other])], shown[np.concatenate([other, one])]
-        first = np.concatenate([[0], np.cumsum(np.bincount(one, minlength=len(x)))]).astype(np.int64)
+        x, y, radius = x[shown], y[shown], radius[shown]
+        if len(shown) <= FEW:
+            apart = np.square(x[:, None] - x) + np.square(y[:, None] - y)
+            meets = apart < np.square(radius[:, None] + radius)
+            np.fill_diagonal(meets, False)
+            one, other = np.nonzero(meets)
+        else:
+            one, other = touching(x, y, radius)
+            one, other = np.concatenate([one, other]), np.concatenate([other, one])
+        one, other = shown[one], shown[other]
+        first = np.concatenate([[0], np.cumsum(np.bincount(one, minlength=len(self.caps)))]).astype(np.int64)
         return first, other[np.argsort(one, kind="stable")].astype(np.int64)
 
     # -- drawn ---------------------------------------------------------------------------------------------------------
@@ -324,7 +344,7 @@ def _middles(count: int) -> Array:
     return (np.arange(count) + 0.5) / count - 0.5
 
 
-def _behind(chamber: Chamber, panel: int) -> tuple[Array, float]:
+def _behind(chamber: Chamber, panel: int) -> tuple[Any, float]:
     """Faces behind a panel's far one, (F, 3), and the distance of the last face of all: see `compiled.cap_rays`."""
     later, here, index = [], float(chamber.faces[panel]) + chamber.panels[panel].thickness, 1.0
     for i in range(panel + 1, len(chamber.panels)):
@@ -335,7 +355,8 @@ def _behind(chamber: Chamber, panel: int) -> tuple[Array, float]:
         if math.isfinite(chamber.panels[i].thickness) and not touching_next:
             later.append((chamber.panels[i].thickness, n, 1.0))
             here, index = near + chamber.panels[i].thickness, 1.0
-    return np.array(later, dtype=np.float32).reshape(-1, 3), here
+    faces: Image = np.array(later, dtype=np.float32).reshape(-1, 3)
+    return faces, here
 
 
 def _view(camera: Camera, frame: PanelFrame, end: float, depth: float) -> Array:

@@ -39,7 +39,9 @@ def scene_of(camera: Camera, chamber: Chamber, depth: float) -> CapScene:
 
 
 @pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize(("place", "radius", "angle"), [((-4, 3), 1.0, 40), ((7, -5), 1.4, 80), ((2, 1), 0.5, 8), ((-9, 6), 0.8, 120)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("place", "radius", "angle"), [((-4, 3), 1.0, 40), ((7, -5), 1.4, 80), ((2, 1), 0.5, 8), ((-9, 6), 0.8, 120)]
+)
 def test_rays_of_a_tile_are_those_of_the_tracer(view, place, radius, angle):
     """In ten-thousandths of a pixel of the frame, where the lens does not bend the lattice much."""
     from rainstereo.compiled.cap_rays import GAIN, OWN, PLANES, Y_, fit
@@ -232,3 +234,33 @@ def test_a_table_of_drops_many_of_which_overlap():
     numbers = np.bincount(np.concatenate([table.pixels for table in plan.tables]), minlength=120_000)
     assert numbers.max() == 1
     assert plan.apply(image).shape == image.shape
+
+
+def test_small_drops_under_gravity_are_drawn_as_caps_where_the_bound_allows_it():
+    from rainstereo.rain.cap_tier import cap_bound
+    from rainstereo.tiers import Method
+    from rainstereo.young_laplace_drop import YoungLaplaceDrop
+
+    image = photograph()
+    drops = [
+        YoungLaplaceDrop((0.004 * i - 0.008, 0.002 * i - 0.004), radius, math.radians(60))
+        for i, radius in enumerate((1e-4, 2.5e-4, 4e-4, 8e-4))
+    ]
+    exact = Renderer(CAMERA, PANE, DEPTH).plan(drops)
+    chosen, errors = {}, list[float]()
+    for tolerance in (0.5, 4.0, 40.0):
+        plan = Renderer(CAMERA, PANE, DEPTH, tolerance=tolerance, moving=True).plan(drops)
+        chosen[tolerance] = [tier.tier.method is Method.CAP for tier in plan.tiers]
+        assert all(tier.bound <= tolerance for tier in plan.tiers)
+        assert plan.drops == tuple(drops)
+        inside = exact.opacity > 0
+        errors.append(rms((plan.apply(image).astype(float) - exact.apply(image))[inside]))
+        assert errors[-1] <= errors[0] + tolerance
+    assert errors[0] <= 8.0
+    assert chosen[0.5] == [False] * 4
+    assert sum(chosen[0.5]) < sum(chosen[4.0]) < sum(chosen[40.0])
+    bounds = [cap_bound(drop, CAMERA, PANE, DEPTH) for drop in drops]
+    assert bounds == sorted(bounds)
+    weightless = YoungLaplaceDrop((0.0, 0.0), 8e-4, math.radians(60), bond=0.0)
+    assert cap_bound(weightless, CAMERA, PANE, DEPTH) < 0.05
+    assert Renderer(CAMERA, PANE, DEPTH).plan(drops).tiers[0].bound == 0
