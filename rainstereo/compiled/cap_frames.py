@@ -94,7 +94,7 @@ def frame(
                     patches(rays, low, high, number_of_looks, most, shift, last)
                     shares_of_row(tile, t, s, lanes, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
-                        taken(tile, t, s, lanes, caps, number, rivals, outline, line, rays)
+                        taken(tile, t, s, lanes, wide, caps, number, rivals, outline, line, rays)
                     if mode != DRAW:
                         record_row(
                             mode == FILL, v * width + u1, number, lanes, low, high, tiny, hangs, tile, t, s, edge, cap,

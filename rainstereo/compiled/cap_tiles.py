@@ -336,22 +336,31 @@ def _down(tile: Any, plane: Any, t: Any, s: Any) -> Any:
 
 @compiled
 def taken(
-    tile: Any, t: Any, s: Any, lanes: Any, caps: Any, number: Any, rivals: Any, outline: Any, line: Any,
+    tile: Any, t: Any, s: Any, lanes: Any, wide: Any, caps: Any, number: Any, rivals: Any, outline: Any, line: Any,
     rays: Any,
 ) -> None:  # fmt: skip
-    """Give up the pixels of a row where another cap has more room: nothing of them is hidden by this one."""
+    """Give up the pixels of a row where another cap, that may hide some of them, has more room.
+
+    As in `drop_grid`, room is counted from the circle that a cap covers seen along the normal: its sphere's, if it
+    hangs over.
+    """
     of_row(tile, t, line)
     take_up(line, s, 0, (lanes + 7) // 8 * 8, rays)
     x, y, alike = caps[number, CAP_X], caps[number, CAP_Y], np.float32(ALIKE * caps[number, CAP_SQUARE])
-    first = int(outline[OUT_RIVAL])
+    first, own = int(outline[OUT_RIVAL]), np.float32(min(caps[number, CAP_DEPTH], 0.0) ** 2)
     for i in range(first, first + int(outline[OUT_RIVALS])):
         other = rivals[i]
         dx, dy = np.float32(caps[other, CAP_X] - x), np.float32(caps[other, CAP_Y] - y)
-        square = np.float32(caps[other, CAP_SQUARE])
-        need = -alike if _comes_before(caps, other, number) else alike
+        square, depth = np.float32(caps[other, CAP_SQUARE]), np.float32(caps[other, CAP_DEPTH])
+        need = own - np.float32(min(caps[other, CAP_DEPTH], 0.0) ** 2)
+        need += -alike if _comes_before(caps, other, number) else alike
+        edge = np.float32(1.45 * math.sqrt(caps[other, CAP_SQUARE]) * wide + wide * wide)
         for j in range(np.uint64(lanes)):
-            px, py = rays[PX + j] - dx, rays[PY + j] - dy
-            if square - px * px - py * py > rays[ROOM + j] + need:
+            px, py, kx, ky = rays[PX + j] - dx, rays[PY + j] - dy, rays[KX + j], rays[KY + j]
+            room = square - px * px - py * py
+            b = px * kx + py * ky + np.float32(math.sqrt(ONE - kx * kx - ky * ky)) * depth
+            by_side = b * b + room if b < ZERO else room
+            if room > rays[ROOM + j] + need and by_side > -edge:
                 rays[HIDDEN + j] = ZERO
 
 
