@@ -105,7 +105,7 @@ def test_no_worse_than_without_numba(name, monkeypatch):
     [
         cap(14.2, 10.6, 1.2, 60),
         cap(15.1, 0, 0.4, 60),
-        cap(3, -2, 40, 30),
+        pytest.param(cap(3, -2, 40, 30), marks=pytest.mark.slow),
         cap(1, 1, 0.02, 70),
         cap(1, 1, 0.1, 70),
         cap(-10, 7, 0.7, 150),
