@@ -89,7 +89,7 @@ class Renderer:
     in machine code (`moving_caps`; needs numba, `rainstereo.compiled`), so that a plan costs next to nothing, and
     pixels in drops are off by 2 gray levels or so, at tolerances from 2.5 on by some more, in less time. Without numba,
     with lenses that only mrcal knows, and for other shapes, drops are planned with a few looks a pixel (`single_ray`):
-    in some ten times as long, and off by 4. Drops under gravity are drawn as caps of their volume where the bound of
+    in some four times as long, and off by 4. Drops under gravity are drawn as caps of their volume where the bound of
     what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).
     lasting: whether a plan serves thousands of frames: planned some five times as long, frames drawn in half the time,
     with the same error (`pursuit`). 16-bit and floating point frames may then show values a little beyond the image's.
