@@ -21,9 +21,9 @@ def inlined(loop: Loop) -> Loop:
 def compiled(loop: Loop) -> Loop:
     """The loop in machine code: it releases the lock, checks no index and divides as IEEE 754 says.
 
-    numba compiles anew when the loop's own file has changed. After a change to an `inlined` or `compiled` part in another
-    file, remove `__pycache__/*.nb?`. Where neither the package's folder nor the user's cache can be written to, it is
-    compiled in every process.
+    numba compiles anew when the loop's own file has changed. After a change to a part of it that another file holds,
+    remove `__pycache__/*.nb?`. Where neither the package's folder nor the user's cache can be written to, it is compiled
+    in every process.
     """
     try:
         found = numba.njit(cache=True, **SETTINGS)(loop)
