@@ -22,8 +22,8 @@ def compiled(loop: Loop) -> Loop:
     """The loop in machine code: it releases the lock, checks no index and divides as IEEE 754 says.
 
     numba compiles anew when the loop's own file has changed. After a change to a part of it that another file holds,
-    remove `__pycache__/*.nb?`. Where neither the package's folder nor the user's cache can be written to, it is compiled
-    in every process.
+    remove `__pycache__/*.nb?`. Where neither the package's folder nor the user's cache can be written to, loops are
+    compiled in every process.
     """
     try:
         found = numba.njit(cache=True, **SETTINGS)(loop)
