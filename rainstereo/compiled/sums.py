@@ -1,0 +1,71 @@
+"""Weighted sums of texels, row by row of a table (`rain.lookups`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rainstereo.rain.words import BELOW, EVERY, FIELD
+
+from .compile import compiled
+
+U = np.uint64
+ONE = U(EVERY)
+
+
+@compiled
+def _clipped(word: Any) -> Any:
+    """Fields, whose lowest 9 bits are values + `BELOW`, brought between 0 and 255."""
+    word = (word & (ONE * U(511))) + ONE * U(256 - BELOW)
+    over = word & (ONE << U(9))
+    word |= (over >> U(1)) - (over >> U(9))
+    over = ((over >> U(1)) | word) & (ONE << U(8))
+    return word & (over - (over >> U(8)))
+
+
+@compiled
+def sum_words(
+    out: Any, below: Any, first: int, channels: int, words: Any, shift: int, pixels: Any, counts: Any, texels: Any,
+    weights: Any, roundings: Any, clear: Any,
+) -> None:  # fmt: skip
+    """Write some channels of pixels: sums of words times weights, + clear x the pixel of `below`.
+
+    out, below: (P, C) uint8; first, channels: which of them, at most three. words: (N,) uint64. shift: bits of a
+    weight's unit. pixels, counts: (M,) uint32. texels, weights: (T,) uint32, int16. roundings, clear: (M,) uint32,
+    uint16, units of weights; the first for every channel, with `BELOW` gray levels in it.
+    """
+    start, middle, last = U(first), U(first + 1), U(first + 2)
+    tap = U(0)
+    for row in range(U(len(pixels))):
+        pixel = U(pixels[row])
+        total = ONE * U(roundings[row])
+        for each in range(tap, tap + U(counts[row])):
+            total += words[texels[each]] * U(np.int64(weights[each]))
+        tap += U(counts[row])
+        if clear[row]:
+            own = U(below[pixel, start])
+            if channels > 1:
+                own |= U(below[pixel, middle]) << U(FIELD)
+            if channels > 2:
+                own |= U(below[pixel, last]) << U(2 * FIELD)
+            total += own * U(clear[row])
+        total = _clipped(total >> U(shift))
+        out[pixel, start] = np.uint8(total & U(255))
+        if channels > 1:
+            out[pixel, middle] = np.uint8((total >> U(FIELD)) & U(255))
+        if channels > 2:
+            out[pixel, last] = np.uint8((total >> U(2 * FIELD)) & U(255))
+
+
+@compiled
+def sum_numbers(total: Any, values: Any, counts: Any, texels: Any, weights: Any) -> None:
+    """Write sums of values, (N, C) float32, times weights, (T,) int16, to `total`, (M, C) float32."""
+    tap = U(0)
+    for row in range(U(len(total))):
+        total[row] = 0
+        for each in range(tap, tap + U(counts[row])):
+            weight, texel = np.float32(weights[each]), texels[each]
+            for channel in range(U(values.shape[1])):
+                total[row, channel] += values[texel, channel] * weight
+        tap += U(counts[row])
