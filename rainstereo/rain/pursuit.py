@@ -20,17 +20,19 @@ from functools import cache, cached_property
 import numpy as np
 from scipy.sparse import csr_array
 
+from rainstereo import compiled
 from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.types import Array, Image, Indices, Mask
 
-from .pyramid import Copy, copies, copy_starts, sizes
+from .pyramid import LONG, PAIRED, Copy, copies, copy_starts, sizes
 from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, steps_between, whole
 
-SHAPES = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 1), (1, 2), (2, 2))
+HALVINGS = 3
+SHAPES = tuple((a, b) for a in range(HALVINGS + 1) for b in range(HALVINGS + 1) if abs(a - b) <= LONG)
 """Of texels offered: halvings across and down, from the window's."""
-SIDE = 20  # texels along a window
+ALIGNED = 1 << HALVINGS
+SIDE = 3 * ALIGNED  # texels along a window
 BINS = 2  # places along one of them to which rays are rounded
-ALIGNED = 4
 ROOM = SIDE - ALIGNED + 1  # texels that rays may span, wherever they are
 POINTS = 4  # along a texel's side that stand for its area
 MOST = 40  # texels of a pixel
@@ -46,8 +48,6 @@ SCREENED, OFFERED = 8, 256
 ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
 TOGETHER = 128  # pixels: few enough for the caches
 QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-FINEST, DEAR = 2, 1.0
-"""Levels below this have so many texels that making them ready for sums costs, too; what one of these counts for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +123,9 @@ class Pursuit:
             )
             j, i = (np.clip(at, 0, places - 1).astype(np.intp) for at in (j, i))
             bins[part] = i * places + j
-        rays = bins[0].size // count * len(QUARTERS)
-        where = np.moveaxis(bins, -1, 0).reshape(count, rays)
+        where = np.moveaxis(bins, -1, 0).reshape(count, -1)
         share = np.tile(np.float32(0.25) * weights.T, len(QUARTERS))
-        ends = np.arange(0, (count + 1) * rays, rays)
-        common = csr_array((share.ravel(), where.ravel(), ends), shape=(count, places**2)) @ words.of_bins
+        common = _common(words, where, share)
         offered, numbers = self._offered(level, first)
         along = _sums(common.reshape(count, SIDE, SIDE))
         taken, counts = _taken(words, along, offered, self._prices(level))
@@ -139,8 +137,8 @@ class Pursuit:
         """What each texel of a window must be worth, (A,)."""
         price = []
         for across, down in SHAPES:
-            fine = level + min(across, down) < FINEST
-            price.append(self.worth * (1.0 if not fine else DEAR if across == down else np.inf))
+            there = across == down or level + min(across, down) >= PAIRED
+            price.append(self.worth if there else np.inf)
         return np.repeat(price, [(SIDE >> shape[0]) * (SIDE >> shape[1]) for shape in SHAPES])
 
     def _offered(self, level: int, first: Indices) -> tuple[Mask, Indices]:
@@ -163,11 +161,21 @@ class Pursuit:
 
 @dataclass(frozen=True, eq=False)
 class _Dictionary:
-    """What texels of a window have in common. of_bins: (bins, side^2) of places with the window's own texels. gram: (A,
-    A) of texels with one another. Square gray levels."""
+    """What texels of a window have in common. gram: (A, A) of texels with one another. Square gray levels.
 
-    of_bins: Array
-    gram: Array
+    lags: (2, 2, n, n) of a place with a texel so far away, even and odd steps of `BINS` apart; the last place first.
+    """
+
+    lags: Image
+    gram: Image
+
+    @cached_property
+    def of_bins(self) -> Image:
+        """(bins, side^2) of places with the window's own texels."""
+        place, cell = np.arange(SIDE * BINS), np.arange(SIDE)
+        odd, step = place % BINS, SIDE - 1 - place[:, None] // BINS + cell
+        table = self.lags[odd[:, None, None, None], odd[:, None, None], step[:, None, :, None], step[None, :, None]]
+        return table.reshape(len(place) ** 2, SIDE**2)
 
 
 @cache
@@ -176,19 +184,30 @@ def _dictionary(level: int) -> _Dictionary:
     points = min(POINTS, 2**level)
     inside = (np.arange(points) + 0.5) / points - 0.5
     inside = np.stack(np.meshgrid(inside, inside), -1).reshape(-1, 2)
-    every = np.arange(-(SIDE - 1) * BINS, SIDE * BINS)
-    away = (every + 0.5) / BINS - 0.5
-    of_bins = _covariance(scene, away, inside, texel)
+    away = (np.arange(-(SIDE - 1) * BINS, SIDE * BINS) + 0.5) / BINS - 0.5
+    of_places = _covariance(scene, away, inside, texel).astype(np.float32)
+    split = of_places.reshape(len(away) // BINS, BINS, len(away) // BINS, BINS)
+    lags = np.ascontiguousarray(np.moveaxis(split, (1, 3), (0, 1))[:, :, ::-1, ::-1])
     between = (inside[:, None] - inside).reshape(-1, 2)
     own = _covariance(scene, np.arange(1.0 - SIDE, SIDE), between, texel)
-    place, cell = np.arange(SIDE * BINS), np.arange(SIDE)
-    step = place[:, None] - BINS * cell + (SIDE - 1) * BINS  # of a bin and a texel, along an axis
-    table = of_bins[step[:, None, :, None], step[None, :, None, :]].reshape(len(place) ** 2, SIDE**2)
-    lag = cell[:, None] - cell + SIDE - 1
+    lag = np.arange(SIDE) - np.arange(SIDE)[:, None] + SIDE - 1
     base = own[lag[:, None, :, None], lag[None, :, None, :]].reshape(SIDE**2, SIDE**2)
     whole = _sums(base.reshape(-1, SIDE, SIDE))
     gram = _sums(np.ascontiguousarray(whole.T).reshape(-1, SIDE, SIDE))
-    return _Dictionary(table.astype(np.float32), gram.astype(np.float32))
+    return _Dictionary(lags, gram.astype(np.float32))
+
+
+def _common(words: _Dictionary, where: Indices, share: Image) -> Image:
+    """Covariances of pixels with the texels of a window, (M, side^2). where, share: (M, K) places and weights of rays."""
+    if compiled.available():
+        from rainstereo.compiled.pursuit import correlate
+
+        found: Image = np.zeros((len(where), SIDE**2), dtype=np.float32)
+        correlate(words.lags, where, share, SIDE, found)
+        return found
+    ends = np.arange(0, where.size + 1, where.shape[1])
+    matrix = csr_array((share.ravel(), where.ravel(), ends), shape=(len(where), (SIDE * BINS) ** 2))
+    return np.asarray(matrix @ words.of_bins)
 
 
 def _scene(level: int) -> SceneStatistics:
@@ -221,10 +240,15 @@ def _sums(values: Array) -> Array:
 
 def _taken(words: _Dictionary, along: Array, offered: Mask, price: Array) -> tuple[Indices, Indices]:
     """Numbers of texels taken, (M, MOST), and how many, (M,). along: (M, A) covariances with the pixels."""
-    count, variance = len(along), np.diag(words.gram)
-    gram = words.gram
+    gram, count, variance = words.gram, len(along), np.diag(words.gram)
     taken: Indices = np.zeros((count, MOST), dtype=np.intp)
     counts: Indices = np.zeros(count, dtype=np.intp)
+    if compiled.available():
+        from rainstereo.compiled.pursuit import take
+
+        least = np.float32(FRESH) * variance
+        take(gram, along.astype(np.float32), offered, price.astype(np.float32), least, SCREENED, OFFERED, taken, counts)
+        return taken, counts
     rows, every = np.arange(count), np.arange(count)
     columns: Indices = np.broadcast_to(np.arange(len(variance)), along.shape)
     rest: Image = along.astype(np.float32)

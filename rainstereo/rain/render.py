@@ -27,9 +27,10 @@ from . import drop_list, linear_light
 from .blurred import BlurredLayer, by_disc
 from .drops import Drops
 from .looks import Looks, PasteLooks
-from .lookups import Lookups, Paste
+from .lookups import Lookups
 from .minified import Batch, Minifier
 from .outlines import Outlines
+from .paste import Paste
 from .rendered import Rendered
 from .single_ray import SingleRay
 from .streaks import Streak
@@ -268,7 +269,7 @@ class Plan:
         if self.renderer.moving:
             return PasteLooks([table for table in self.tables if isinstance(table, Looks)])
         tables = [table for table in self.tables if isinstance(table, Lookups)]
-        return Paste(tables, self.renderer.scene_size, self.renderer.camera.width)
+        return Paste(tables, self.renderer.scene_size)
 
     def _in_light(self, image: Image, out: Image) -> None:
         """The same, averaging light; only pixels that drops touch are converted back."""
