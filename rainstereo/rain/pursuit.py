@@ -43,7 +43,7 @@ SHRUNK = 4
 NEGATIVE = 0.45
 """What weights below 0 may add up to: sums of bytes have room for it, and a spot of light leaves no dark rings."""
 FRESH = 1e-4  # part of a texel's variance that must be news after those taken before
-SCREENED, OFFERED = 8, 256
+SCREENED, OFFERED = 12, 256
 """After so many texels of a pixel only so many others, those worth most then, are offered to it."""
 ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
 TOGETHER = 128  # pixels: few enough for the caches

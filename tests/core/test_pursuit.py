@@ -100,7 +100,7 @@ def test_weights_are_the_best_ones():
         for texel, number in zip(taps.texels[some], which, strict=True):
             copy = shapes[number]
             corner = np.array(divmod(texel - firsts[number], copy.width))[::-1]
-            many = [min(4 << (halvings - finest), 16) for halvings in (copy.across, copy.down)]
+            many = [16 if halvings - finest > 2 else 8 for halvings in (copy.across, copy.down)]
             inside = np.stack(np.meshgrid(*((np.arange(n) + 0.5) / n for n in many)), -1).reshape(-1, 2)
             points.append((corner + inside) * [2**copy.across, 2**copy.down] - 0.5)
         own, across, along = (np.stack(part, -1)[:, pixel] for part in ((x, y), steps[:2], steps[2:]))
