@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -24,7 +25,7 @@ from rainstereo import compiled
 from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.types import Array, Image, Indices, Mask
 
-from .pyramid import LONG, PAIRED, Copy, copies, copy_starts, sizes
+from .pyramid import LONG, Copy, copies, copy_starts, sizes
 from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, steps_between, whole
 
 HALVINGS = 3
@@ -47,6 +48,7 @@ SCREENED, OFFERED = 12, 256
 """After so many texels of a pixel only so many others, those worth most then, are offered to it."""
 ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
 TOGETHER = 128  # pixels: few enough for the caches
+AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
 QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 
@@ -125,38 +127,69 @@ class Pursuit:
             bins[part] = i * places + j
         where = np.moveaxis(bins, -1, 0).reshape(count, -1)
         share = np.tile(np.float32(0.25) * weights.T, len(QUARTERS))
+        if compiled.available():
+            return self._compiled(level, first, where, share)
         common = _common(words, where, share)
-        offered, numbers = self._offered(level, first)
+        offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
-        taken, counts = _taken(words, along, offered, self._prices(level))
-        weight = _weights(words, along, taken, counts, weights.sum(0, dtype=np.float64))
+        taken, counts = _taken(words, along, offered, np.float32(self.worth))
+        weight = _weights(words, along, taken, counts, share.sum(1, dtype=np.float64))
         texel = np.take_along_axis(numbers, taken, 1)
         return _Chosen(texel, weight, counts)
 
-    def _prices(self, level: int) -> Array:
-        """What each texel of a window must be worth, (A,)."""
-        price = []
-        for across, down in SHAPES:
-            there = across == down or level + min(across, down) >= PAIRED
-            price.append(self.worth if there else np.inf)
-        return np.repeat(price, [(SIDE >> shape[0]) * (SIDE >> shape[1]) for shape in SHAPES])
+    def _compiled(self, level: int, first: Indices, where: Indices, share: Image) -> _Chosen:
+        from rainstereo.compiled.pursuit import choose
 
-    def _offered(self, level: int, first: Indices) -> tuple[Mask, Indices]:
-        """Which texels of windows the image has, and their numbers, (M, A)."""
-        column, row = first
-        offered, numbers = [], []
-        at = {(copy.across, copy.down): (copy, start) for copy, start in self._copies}
-        for across, down in SHAPES:
-            copy, start = at.get((level + across, level + down), (Copy(0, 0, 0, 0), 0))
-            j = (column >> across)[:, None, None] + np.arange(SIDE >> across)
-            i = (row >> down)[:, None, None] + np.arange(SIDE >> down)[:, None]
-            offered.append(((j < copy.width) & (i < copy.height)).reshape(len(column), -1))
-            numbers.append((start + i * copy.width + j).reshape(len(column), -1))
-        return np.concatenate(offered, 1), np.concatenate(numbers, 1)
+        words, count = _dictionary(level), len(where)
+        texel: Indices = np.zeros((count, MOST), dtype=np.intp)
+        weight: Array = np.zeros((count, MOST))
+        counts: Indices = np.zeros(count, dtype=np.intp)
+        shapes = np.array([(*shape, *self._limits(level, shape)) for shape in SHAPES], dtype=np.int64)
+        least = np.float32(FRESH) * np.diag(words.gram)
+        choose(
+            words.lags, words.gram, _atoms(), shapes, np.float32(self.worth), least, SCREENED, OFFERED, first, where,
+            share, _boxes(where, share), texel, weight, counts,
+        )  # fmt: skip
+        return _Chosen(texel, weight, counts)
+
+    def _limits(self, level: int, shape: tuple[int, int]) -> tuple[int, int, int]:
+        """Width and height of the copy that has texels of a shape, 0 if there is none, and the number of its first."""
+        copy, start = self._copies.get((level + shape[0], level + shape[1]), (Copy(0, 0, 0, 0), 0))
+        return copy.width, copy.height, start
+
+    def _offered(self, level: int, first: Indices, boxes: Indices) -> tuple[Mask, Indices]:
+        """Which texels of windows the image has and boxes meet, and their numbers, (M, A)."""
+        number, j, i = _atoms().T
+        across, down = np.array(SHAPES)[number].T
+        width, height, start = np.array([self._limits(level, shape) for shape in SHAPES])[number].T
+        x, y = (first[0][:, None] >> across) + j, (first[1][:, None] >> down) + i
+        left, right, top, bottom = boxes.T[:, :, None]
+        near = ((j << across) <= right) & (((j + 1) << across) > left)
+        near &= ((i << down) <= bottom) & (((i + 1) << down) > top)
+        return near & (x < width) & (y < height), start + y * width + x
 
     @cached_property
-    def _copies(self) -> list[tuple[Copy, int]]:
-        return list(zip(copies(self.size), copy_starts(self.size), strict=False))
+    def _copies(self) -> dict[tuple[int, int], tuple[Copy, int]]:
+        every = zip(copies(self.size), copy_starts(self.size), strict=False)
+        return {(copy.across, copy.down): (copy, start) for copy, start in every}
+
+
+@cache
+def _atoms() -> Indices:
+    """Of each texel offered, (A, 3), the number of its shape, its column and row among those of the shape."""
+    found = []
+    for number, (across, down) in enumerate(SHAPES):
+        i, j = np.mgrid[: SIDE >> down, : SIDE >> across]
+        found.append(np.stack([np.full(i.size, number), j.ravel(), i.ravel()], -1))
+    return np.concatenate(found).astype(np.intp)
+
+
+def _boxes(where: Indices, share: Array) -> Indices:
+    """First and last column, first and last row, (M, 4), of the window's texels that rays meet, and one more around."""
+    lit, found = share > 0, []
+    for place in (where % (SIDE * BINS) // BINS, where // (SIDE * BINS) // BINS):
+        found += [np.where(lit, place, SIDE).min(1) - AROUND, np.where(lit, place, -1).max(1) + AROUND]
+    return np.stack(found, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +232,6 @@ def _dictionary(level: int) -> _Dictionary:
 
 def _common(words: _Dictionary, where: Indices, share: Image) -> Image:
     """Covariances of pixels with the texels of a window, (M, side^2). where, share: (M, K) places and weights of rays."""
-    if compiled.available():
-        from rainstereo.compiled.pursuit import correlate
-
-        found: Image = np.zeros((len(where), SIDE**2), dtype=np.float32)
-        correlate(words.lags, where, share, SIDE, found)
-        return found
     ends = np.arange(0, where.size + 1, where.shape[1])
     matrix = csr_array((share.ravel(), where.ravel(), ends), shape=(len(where), (SIDE * BINS) ** 2))
     return np.asarray(matrix @ words.of_bins)
@@ -238,34 +265,27 @@ def _sums(values: Array) -> Array:
     return np.concatenate([found[shape].reshape(len(values), -1) for shape in SHAPES], 1)
 
 
-def _taken(words: _Dictionary, along: Array, offered: Mask, price: Array) -> tuple[Indices, Indices]:
+def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple[Indices, Indices]:
     """Numbers of texels taken, (M, MOST), and how many, (M,). along: (M, A) covariances with the pixels."""
     gram, count, variance = words.gram, len(along), np.diag(words.gram)
     taken: Indices = np.zeros((count, MOST), dtype=np.intp)
     counts: Indices = np.zeros(count, dtype=np.intp)
-    if compiled.available():
-        from rainstereo.compiled.pursuit import take
-
-        least = np.float32(FRESH) * variance
-        take(gram, along.astype(np.float32), offered, price.astype(np.float32), least, SCREENED, OFFERED, taken, counts)
-        return taken, counts
     rows, every = np.arange(count), np.arange(count)
     columns: Indices = np.broadcast_to(np.arange(len(variance)), along.shape)
     rest: Image = along.astype(np.float32)
     news: Image = np.where(offered, variance, np.float32(np.inf))
-    cost, least = price.astype(np.float32), np.float32(FRESH) * variance
+    least = np.float32(FRESH) * variance
     bases: Image = np.empty((MOST, *along.shape), dtype=np.float32)
     for number in range(MOST):
         score: Image = rest * rest
         score /= news
-        score /= cost
         best = score.argmax(1)
-        good = score[every, best] > (number > 0)  # the first is taken whatever it is worth: sums of weights are kept
+        good = score[every, best] > (price if number else 0)  # the first is taken whatever it is worth: sums of weights are kept
         if number == SCREENED and len(variance) > OFFERED:
             keep = np.sort(np.argpartition(score, -OFFERED, axis=1)[:, -OFFERED:], axis=1)
             best = np.take_along_axis(score, keep, 1).argmax(1)
             columns, rest, news = (np.take_along_axis(each, keep, 1) for each in (columns, rest, news))
-            cost, least = cost[columns], least[columns]
+            least = least[columns]
             fewer: Image = np.empty((MOST, *rest.shape), dtype=np.float32)
             for old, new in zip(bases[:number], fewer, strict=False):
                 new[...] = np.take_along_axis(old, keep, 1)
@@ -274,13 +294,13 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Array) -> tup
             if not good.any():
                 break
             rows, best, rest, news, columns = (each[good] for each in (rows, best, rest, news, columns))
-            cost, least = (each[good] if each.ndim == 2 else each for each in (cost, least))
+            least = least[good] if least.ndim == 2 else least
             bases = np.concatenate([bases[:number, good], np.empty((MOST - number, *rest.shape), np.float32)])
             every, good = np.arange(len(rows)), good[good]
         chosen = columns[every, best]
         taken[rows[good], number] = chosen[good]
         counts[rows[good]] += 1
-        base = gram[chosen] if cost.ndim == 1 else gram[chosen[:, None], columns]
+        base = gram[chosen] if least.ndim == 1 else gram[chosen[:, None], columns]
         for before in bases[:number]:
             base -= before[every, best][:, None] * before
         base *= (1 / np.sqrt(news[every, best]))[:, None]
