@@ -14,22 +14,22 @@ FAR = np.float32(np.inf)
 
 @compiled
 def choose(
-    lags: Any, gram: Any, atoms: Any, shapes: Any, price: float, least: Any, screened: int, fewer: int, first: Any,
+    lags: Any, gram: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int, fewer: int, first: Any,
     where: Any, share: Any, boxes: Any, texel: Any, weight: Any, counts: Any,
 ) -> None:  # fmt: skip
     """Write texels and their weights, (M, MOST) int64, float64, and how many, (M,).
 
     lags, gram: `rain.pursuit._Dictionary`. atoms: (A, 3) int64 shape, column and row of each texel of a window, those
     of the window's own first. shapes: (S, 5) int64 halvings across and down, width, height and first number of the
-    copy, which is empty if none is offered. price: what a texel must be worth. least: (A,) float32, what must be news of
-    its variance. After so many texels (`screened`) only `fewer` others, those worth most then, are offered. first:
+    copy, which is empty if none is offered. price, least: (A,) float32: what a texel must be worth, and what must be
+    news of its variance. After so many texels (`screened`) only `fewer` others, those worth most then, are offered. first:
     (2, M) column and row of the windows. where, share: (M, K) places of rays in windows, and their weights. boxes: (M, 4) columns and rows near.
     """
     size, most, rays = U(len(atoms)), U(texel.shape[1]), U(where.shape[1])
     side = U(lags.shape[2] + 1) // U(2)
     along, common = np.empty(size, np.float32), np.zeros((side, side), np.float32)
     columns, rest, news = np.empty(size, np.uint32), np.empty(size, np.float32), np.empty(size, np.float32)
-    low, score = np.empty(size, np.float32), np.empty(size, np.float32)
+    cost, low, score = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     order = score.view(np.int32)  # as the numbers, which are not negative
     base, bases = np.empty(size, np.float32), np.empty((most, size), np.float32)
     taken, starts, weights = np.empty(most, np.uint64), np.empty(rays + U(4), np.int64), np.empty(rays + U(4), np.float32)
@@ -46,24 +46,24 @@ def choose(
             x, y = (first[U(0), pixel] >> across) + j, (first[U(1), pixel] >> down) + k
             if near and x < shapes[shape, U(2)] and y < shapes[shape, U(3)]:
                 columns[there], rest[there], news[there] = i, along[i], gram[i, i]
-                low[there] = least[i]
+                cost[there], low[there] = price[i], least[i]
                 there += U(1)
         count = U(0)
         for number in range(most):
             best, highest = U(0), np.int32(0)
             for i in range(there):
-                score[i] = rest[i] * rest[i] / news[i]
+                score[i] = rest[i] * rest[i] / (news[i] * cost[i])
             for i in range(there):
                 highest = max(highest, order[i])
             while best < there and order[best] != highest:
                 best += U(1)
-            if best == there or (number > U(0) and not score[best] > price):
+            if best == there or (number > U(0) and not score[best] > 1):
                 break
             chosen = U(columns[best])
             taken[number] = chosen
             count += U(1)
             if number == U(screened) and there > U(fewer):
-                there = screen(score, U(fewer), number, there, rest, news, low, columns, bases)
+                there = screen(score, U(fewer), number, there, rest, news, cost, low, columns, bases)
                 best = U(0)
                 while U(columns[best]) != chosen:
                     best += U(1)
@@ -160,7 +160,7 @@ def add(common: Any, shapes: Any, along: Any) -> None:
 
 @compiled
 def screen(
-    score: Any, fewer: int, number: int, there: int, rest: Any, news: Any, low: Any, columns: Any, bases: Any
+    score: Any, fewer: int, number: int, there: int, rest: Any, news: Any, cost: Any, low: Any, columns: Any, bases: Any
 ) -> Any:
     """Keep the texels of the highest scores, in order; of equal ones the first."""
     bound = np.partition(score[:there], there - fewer)[there - fewer]
@@ -171,7 +171,7 @@ def screen(
     for i in range(there):
         if score[i] > bound or (score[i] == bound and even > U(0)):
             even -= U(score[i] == bound)
-            rest[kept], news[kept], low[kept] = rest[i], news[i], low[i]
+            rest[kept], news[kept], cost[kept], low[kept] = rest[i], news[i], cost[i], low[i]
             columns[kept] = columns[i]
             for before in range(number):
                 bases[before, kept] = bases[before, i]

@@ -30,7 +30,7 @@ def pack(values: Any, first: int, channels: int, words: Any) -> None:
 
 @compiled
 def pack_some(values: Any, first: int, channels: int, rows: Any, words: Any) -> None:
-    """The same of some rows, (n,) uint32, to their places in words, (N,)."""
+    """The same of some rows, (n,) uint32; words: (n,)."""
     start, middle, last = U(first), U(first + 1), U(first + 2)
     for i in range(U(len(rows))):
         row = U(rows[i])
@@ -39,15 +39,15 @@ def pack_some(values: Any, first: int, channels: int, rows: Any, words: Any) -> 
             word |= U(values[row, middle]) << U(FIELD)
         if channels > 2:
             word |= U(values[row, last]) << U(2 * FIELD)
-        words[row] = word
+        words[i] = word
 
 
 @compiled
 def average(words: Any, copies: Any) -> None:
     """Make copies of others, in turn, all in `words`, (N,).
 
-    copies: (n, 5) int64: how (`QUARTERS`, `COLUMNS`, `ROWS`), the number of the first texel of what a copy is made of,
-    its width and height, and the number of the copy's own first texel. An odd last column or row is its own pair.
+    copies: (n, 5) int64: how (`QUARTERS`, `COLUMNS`, `ROWS`), the place of the first texel of what a copy is made of,
+    its width and height, and the place of the copy's own first texel. An odd last column or row is its own pair.
     """
     for each in range(U(len(copies))):
         how, width, height = copies[each, U(0)], U(copies[each, U(2)]), U(copies[each, U(3)])

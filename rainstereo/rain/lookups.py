@@ -23,7 +23,7 @@ from .quadtree import Taps
 
 JOINED = 1 << 22  # taps up to which tables are joined
 ROWS = 1 << 14  # that are moved at a time
-TILE = 32  # pixels of the scene
+TILE = 64  # pixels of the scene
 BITS = 10  # of the number of a tile, along an axis
 
 

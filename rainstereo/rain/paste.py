@@ -7,7 +7,7 @@ writes each pixel at once (`rainstereo.compiled.sums`), or, without numba and bi
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -26,7 +26,9 @@ from .texels import Texels
 from .words import BELOW, EVERY, PACKED, clip, packed, unpack
 
 SHIFT = UNIT.bit_length() - 1
-KEPT = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
+KEPT = 1 << 24  # taps up to which places of texels are kept
+AHEAD = 256  # at least that of `compiled.sums`
+MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
 ROWS = 1 << 14  # that are summed at a time: few enough for the caches
 DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black
 
@@ -40,11 +42,20 @@ class Piece:
     rows: slice
     taps: slice
 
-    def matrix(self, kind: type, columns: int) -> Any:
-        """As a sparse matrix. columns: texels that there are."""
+    def cut(self) -> Iterator[tuple[Piece, slice]]:
+        """The same in parts of `ROWS` rows, and each part's taps among those of this."""
+        ends = np.concatenate([[0], np.cumsum(self.table.counts[self.rows], dtype=np.int64)])
+        cuts = [*range(0, len(ends) - 1, ROWS), len(ends) - 1]
+        for a, b in pairwise(cuts):
+            own, first, before = slice(int(ends[a]), int(ends[b])), self.taps.start, self.rows.start
+            taps = slice(own.start + first, own.stop + first)
+            yield Piece(self.number, self.table, slice(before + a, before + b), taps), own
+
+    def matrix(self, kind: type, places: Any, columns: int) -> Any:
+        """As a sparse matrix. places: of the texels of its taps, among so many (columns)."""
         ends = np.concatenate([[0], np.cumsum(self.table.counts[self.rows])]).astype(np.int32)
-        weights, texels = self.table.weights[self.taps].astype(kind), self.table.texels[self.taps]
-        return csr_array((weights, texels, ends), shape=(len(ends) - 1, columns))
+        weights = self.table.weights[self.taps].astype(kind)
+        return csr_array((weights, places.astype(np.int32), ends), shape=(len(ends) - 1, columns))
 
 
 class Paste:
@@ -56,9 +67,8 @@ class Paste:
     def __init__(self, tables: Sequence[Lookups], size: tuple[int, int]) -> None:
         self.tables = [table for table in tables if len(table.pixels)]
         self.size = size
-        self.texels = copy_starts(size)[-1]
         self.soft = np.concatenate([np.zeros(0, np.intp), *(np.flatnonzero(table.clear) for table in self.tables)])
-        self.kept = sum(len(table.texels) for table in self.tables) <= KEPT
+        self.taps = sum(len(table.texels) for table in self.tables)
         self._matrices: dict[type, list[Any]] = {}
         self._spare: deque[Any] = deque()  # memory for words, of which threads take one each
 
@@ -77,25 +87,27 @@ class Paste:
     def _bytes(self, levels: list[Image], below: Image, out: Image, part: slice) -> None:
         """Sums of up to three channels of bytes."""
         try:
-            words = self._spare.pop()
+            row = self._spare.pop()
         except IndexError:
-            words = np.empty(self.texels, dtype=np.uint64)
-        self._needed.put_words(levels, part, words)
+            row = np.empty(self._needed.ends[-1], dtype=np.uint64)
+        self._needed.put_words(levels, part, row)
         if compiled.available():
-            self._compiled(words, below, out, part)
+            self._compiled(row, below, out, part)
         else:
-            self._products(words, below, out, part)
-        self._spare.append(words)
+            self._products(row, below, out, part)
+        self._spare.append(row)
 
     def _compiled(self, words: Any, below: Image, out: Image, part: slice) -> None:
         from rainstereo.compiled.sums import sum_words
 
-        for table, roundings, clear in zip(self.tables, self._roundings, self._clear, strict=True):
-            pixels, counts, texels = (a.view(np.uint32) for a in (table.pixels, table.counts, table.texels))
-            channels = part.stop - part.start
+        channels = part.stop - part.start
+        for piece, places in self._placed:
+            table, rows = piece.table, piece.rows
             sum_words(
-                out, below, part.start, channels, words, SHIFT, pixels, counts, texels, table.weights, roundings, clear
-            )
+                out, below, part.start, channels, words, SHIFT, table.pixels[rows].view(np.uint32),
+                table.counts[rows].view(np.uint32), places, table.weights[piece.taps],
+                self._roundings[piece.number][rows], self._clear[piece.number][rows],
+            )  # fmt: skip
 
     def _products(self, words: Any, below: Image, out: Image, part: slice) -> None:
         for piece, matrix in self._each(np.uint64):
@@ -115,7 +127,7 @@ class Paste:
 
     def _numbers(self, levels: list[Image], below: Image, out: Image) -> None:
         """Sums of anything else, in single precision."""
-        values: Image = np.empty((self.texels, out.shape[1]), dtype=np.float32)
+        values: Image = np.empty((self._needed.ends[-1], out.shape[1]), dtype=np.float32)
         self._needed.put_numbers(levels, values)
         for piece, total in self._totals(values):
             total *= np.float32(1 / UNIT)
@@ -132,36 +144,55 @@ class Paste:
             return
         from rainstereo.compiled.sums import sum_numbers
 
-        for piece in self._pieces:
-            total: Image = np.empty((piece.rows.stop - piece.rows.start, values.shape[1]), dtype=np.float32)
-            texels = piece.table.texels[piece.taps].view(np.uint32)
-            counts = piece.table.counts[piece.rows].view(np.uint32)
-            sum_numbers(total, values, counts, texels, piece.table.weights[piece.taps])
-            yield piece, total
+        for piece, places in self._placed:
+            for some, taps in piece.cut():
+                total: Image = np.empty((some.rows.stop - some.rows.start, values.shape[1]), dtype=np.float32)
+                counts = some.table.counts[some.rows].view(np.uint32)
+                sum_numbers(total, values, counts, places[taps], some.table.weights[some.taps])
+                yield some, total
 
     def _each(self, kind: type) -> Iterator[tuple[Piece, Any]]:
         """Each piece and its matrix."""
-        if self.kept and kind not in self._matrices:
-            self._matrices[kind] = [piece.matrix(kind, self.texels) for piece in self._pieces]
-        for place, piece in enumerate(self._pieces):
-            yield piece, self._matrices[kind][place] if self.kept else piece.matrix(kind, self.texels)
+        found = self._matrices.get(kind)
+        if found is None:
+            found = (
+                (some, some.matrix(kind, places[taps], self._needed.ends[-1]))
+                for piece, places in self._placed
+                for some, taps in piece.cut()
+            )
+            if self.taps <= MATRICES:
+                found = self._matrices[kind] = list(found)
+        yield from found
 
     # -- found once ----------------------------------------------------------------------------------------------------
 
+    @property
+    def _placed(self) -> Iterable[tuple[Piece, Any]]:
+        """Pieces, and the places of their texels, `_at`: whole tables, or, to spare memory, parts of them."""
+        return self._kept if self.taps <= KEPT else self._in_parts()
+
     @cached_property
-    def _pieces(self) -> list[Piece]:
-        found = []
-        for number, table in enumerate(self.tables):
-            ends = np.concatenate([[0], np.cumsum(table.counts)])
-            cuts = [*range(0, len(table.pixels), ROWS), len(table.pixels)]
-            found += [
-                Piece(number, table, slice(a, b), slice(int(ends[a]), int(ends[b]))) for a, b in pairwise(cuts)
-            ]
-        return found
+    def _kept(self) -> list[tuple[Piece, Any]]:
+        places = self._needed.places()
+        return [(piece, _at(places, piece)) for piece in self._wholes]
+
+    def _in_parts(self) -> Iterator[tuple[Piece, Any]]:
+        yield from ((some, _at(self._places, some)) for piece in self._wholes for some, _ in piece.cut())
+
+    @cached_property
+    def _places(self) -> Any:
+        return self._needed.places()
+
+    @cached_property
+    def _wholes(self) -> list[Piece]:
+        return [
+            Piece(number, table, slice(0, len(table.pixels)), slice(0, len(table.texels)))
+            for number, table in enumerate(self.tables)
+        ]
 
     @cached_property
     def _needed(self) -> Texels:
-        used = np.zeros(self.texels, dtype=np.bool_)
+        used = np.zeros(copy_starts(self.size)[-1], dtype=np.bool_)
         for table in self.tables:
             used[table.texels] = True
         return Texels.of(self.size, used)
@@ -177,13 +208,21 @@ class Paste:
             np.rint(np.array([c.bias for c in copies(self.size)]) * UNIT), np.diff(copy_starts(self.size))
         ).astype(np.int16)
         found: list[list[Any]] = [[np.zeros(0, dtype=np.uint32)] for _ in self.tables]
-        for piece in self._pieces:  # a whole table at once takes hundreds of MB
+        for piece in (some for whole in self._wholes for some, _ in whole.cut()):  # whole tables take hundreds of MB
             table, counts = piece.table, piece.table.counts[piece.rows]
             of_taps = table.weights[piece.taps] * of_copy[table.texels[piece.taps]].astype(np.int64)
             so_far, ends = np.concatenate([[0], np.cumsum(of_taps)]), np.cumsum(counts)
             shift = np.clip((so_far[ends] - so_far[ends - counts]) / UNIT**2, -DARKEST, DARKEST)
             found[piece.number].append(np.floor((BELOW + 0.5 - shift) * UNIT).astype(np.uint32))
         return [np.concatenate(parts) for parts in found]
+
+
+def _at(places: Any, piece: Piece) -> Any:
+    """Places of a piece's texels, (T + `AHEAD`,) uint32: some more, which loops may look at but not use."""
+    texels = piece.table.texels[piece.taps]
+    found = np.zeros(len(texels) + AHEAD, dtype=np.uint32)
+    np.take(places, texels, out=found[: len(texels)])
+    return found
 
 
 def _as_one(values: Image) -> Any:

@@ -48,6 +48,8 @@ SCREENED, OFFERED = 12, 256
 """After so many texels of a pixel only so many others, those worth most then, are offered to it."""
 ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
 TOGETHER = 128  # pixels: few enough for the caches
+FEW, DEAR = 2, 1.5
+"""Levels below this have so many texels that making and finding them costs, too; what one of these counts for."""
 AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
 QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
@@ -132,7 +134,7 @@ class Pursuit:
         common = _common(words, where, share)
         offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
-        taken, counts = _taken(words, along, offered, np.float32(self.worth))
+        taken, counts = _taken(words, along, offered, self._prices(level))
         weight = _weights(words, along, taken, counts, share.sum(1, dtype=np.float64))
         texel = np.take_along_axis(numbers, taken, 1)
         return _Chosen(texel, weight, counts)
@@ -147,10 +149,15 @@ class Pursuit:
         shapes = np.array([(*shape, *self._limits(level, shape)) for shape in SHAPES], dtype=np.int64)
         least = np.float32(FRESH) * np.diag(words.gram)
         choose(
-            words.lags, words.gram, _atoms(), shapes, np.float32(self.worth), least, SCREENED, OFFERED, first, where,
+            words.lags, words.gram, _atoms(), shapes, self._prices(level), least, SCREENED, OFFERED, first, where,
             share, _boxes(where, share), texel, weight, counts,
         )  # fmt: skip
         return _Chosen(texel, weight, counts)
+
+    def _prices(self, level: int) -> Any:
+        """What each texel of a window must be worth, (A,) float32."""
+        dear = np.array([DEAR if level + min(shape) < FEW else 1.0 for shape in SHAPES])
+        return (self.worth * dear[_atoms()[:, 0]]).astype(np.float32)
 
     def _limits(self, level: int, shape: tuple[int, int]) -> tuple[int, int, int]:
         """Width and height of the copy that has texels of a shape, 0 if there is none, and the number of its first."""
@@ -274,18 +281,18 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple
     columns: Indices = np.broadcast_to(np.arange(len(variance)), along.shape)
     rest: Image = along.astype(np.float32)
     news: Image = np.where(offered, variance, np.float32(np.inf))
-    least = np.float32(FRESH) * variance
+    cost, least = price, np.float32(FRESH) * variance
     bases: Image = np.empty((MOST, *along.shape), dtype=np.float32)
     for number in range(MOST):
         score: Image = rest * rest
-        score /= news
+        score /= news * cost
         best = score.argmax(1)
-        good = score[every, best] > (price if number else 0)  # the first is taken whatever it is worth: sums of weights are kept
+        good = score[every, best] > (number > 0)  # the first is taken whatever it is worth: sums of weights are kept
         if number == SCREENED and len(variance) > OFFERED:
             keep = np.sort(np.argpartition(score, -OFFERED, axis=1)[:, -OFFERED:], axis=1)
             best = np.take_along_axis(score, keep, 1).argmax(1)
             columns, rest, news = (np.take_along_axis(each, keep, 1) for each in (columns, rest, news))
-            least = least[columns]
+            cost, least = cost[columns], least[columns]
             fewer: Image = np.empty((MOST, *rest.shape), dtype=np.float32)
             for old, new in zip(bases[:number], fewer, strict=False):
                 new[...] = np.take_along_axis(old, keep, 1)
@@ -294,7 +301,7 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple
             if not good.any():
                 break
             rows, best, rest, news, columns = (each[good] for each in (rows, best, rest, news, columns))
-            least = least[good] if least.ndim == 2 else least
+            cost, least = (each[good] if each.ndim == 2 else each for each in (cost, least))
             bases = np.concatenate([bases[:number, good], np.empty((MOST - number, *rest.shape), np.float32)])
             every, good = np.arange(len(rows)), good[good]
         chosen = columns[every, best]
