@@ -14,16 +14,18 @@ FAR = np.float32(np.inf)
 
 @compiled
 def choose(
-    lags: Any, gram: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int, fewer: int, first: Any,
-    where: Any, share: Any, boxes: Any, texel: Any, weight: Any, counts: Any,
+    lags: Any, gram: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int, fewer: int, negative: float,
+    ridge: float, grows: float, first: Any, where: Any, share: Any, boxes: Any, texel: Any, weight: Any, counts: Any,
 ) -> None:  # fmt: skip
     """Write texels and their weights, (M, MOST) int64, float64, and how many, (M,).
 
     lags, gram: `rain.pursuit._Dictionary`. atoms: (A, 3) int64 shape, column and row of each texel of a window, those
     of the window's own first. shapes: (S, 5) int64 halvings across and down, width, height and first number of the
     copy, which is empty if none is offered. price, least: (A,) float32: what a texel must be worth, and what must be
-    news of its variance. After so many texels (`screened`) only `fewer` others, those worth most then, are offered. first:
-    (2, M) column and row of the windows. where, share: (M, K) places of rays in windows, and their weights. boxes: (M, 4) columns and rows near.
+    news of its variance. After so many texels (`screened`) only `fewer` others, those worth most then, are offered.
+    negative, ridge, grows: what weights below 0 may add up to, and what their square sum costs, more and more, where it
+    is more. first: (2, M) column and row of the windows. where, share: (M, K) places of rays in windows, and their
+    weights. boxes: (M, 4) columns and rows near.
     """
     size, most, rays = U(len(atoms)), U(texel.shape[1]), U(where.shape[1])
     side = U(lags.shape[2] + 1) // U(2)
@@ -32,7 +34,8 @@ def choose(
     cost, low, score = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     order = score.view(np.int32)  # as the numbers, which are not negative
     base, bases = np.empty(size, np.float32), np.empty((most, size), np.float32)
-    taken, starts, weights = np.empty(most, np.uint64), np.empty(rays + U(4), np.int64), np.empty(rays + U(4), np.float32)
+    taken, starts = np.empty(most, np.uint64), np.empty(rays + U(4), np.int64)
+    weights = np.empty(rays + U(4), np.float32)
     wide = np.empty(side * U(lags.shape[2]), np.float32)
     for pixel in range(U(len(where))):
         correlate(lags, where[pixel], share[pixel], boxes[pixel], starts, weights, common, wide)
@@ -84,7 +87,15 @@ def choose(
         total = 0.0
         for ray in range(rays):
             total += np.float64(share[pixel, ray])
-        solve(gram, along, taken, count, total, weight[pixel])
+        toll = 0.0
+        while True:
+            solve(gram, along, taken, count, total, toll, weight[pixel])
+            below = 0.0
+            for number in range(count):
+                below += min(weight[pixel, number], 0.0)
+            if below >= -negative:
+                break
+            toll = toll * grows if toll > 0 else ridge
         counts[pixel] = count
         for number in range(count):
             i = taken[number]
@@ -101,16 +112,16 @@ def correlate(lags: Any, where: Any, share: Any, box: Any, starts: Any, weights:
     For room: starts, weights: (K + 4,) int64, float32, wide: (side n,) float32. Rows of `wide` are as far apart as
     those of `lags`, so that each ray adds to all of them in one sweep; four rays go together.
     """
-    side, apart = U(len(common)), U(lags.shape[2])
+    side, bins, apart = U(len(common)), U(len(lags)), U(lags.shape[2])
     last = len(common) - 1
     left, right = U(max(box[0], 0) & -8), U(min(box[1], last) | 7) + U(1)
     top, bottom = U(max(box[2], 0) & -8), U(min(box[3], last) | 7) + U(1)
     count, lit, flat = (bottom - top - U(1)) * apart + right - left, U(0), lags.ravel()
     for ray in range(U(len(where))):
-        i, j = U(where[ray]) // (side + side), U(where[ray]) % (side + side)
+        i, j = U(where[ray]) // (bins * side), U(where[ray]) % (bins * side)
         if share[ray] != 0:
-            plane = (i & U(1)) * U(2) + (j & U(1))
-            row, column = U(last) - (i >> U(1)) + top, U(last) - (j >> U(1)) + left
+            plane = i % bins * bins + j % bins
+            row, column = U(last) - i // bins + top, U(last) - j // bins + left
             starts[lit], weights[lit] = (plane * apart + row) * apart + column, share[ray]
             lit += U(1)
     for ray in range(lit, lit + U(4)):
@@ -180,13 +191,13 @@ def screen(
 
 
 @compiled
-def solve(gram: Any, along: Any, taken: Any, count: int, total: float, weight: Any) -> None:
-    """Write the best weights of those that add up to a total, by Cholesky's factors."""
+def solve(gram: Any, along: Any, taken: Any, count: int, total: float, ridge: float, weight: Any) -> None:
+    """Write the best weights of those that add up to a total, by Cholesky's factors; ridge: what their squares cost."""
     factor = np.empty((count, count), np.float64)
     free, even = np.empty(count, np.float64), np.empty(count, np.float64)
     for i in range(count):
         for j in range(i + U(1)):
-            value = np.float64(gram[taken[i], taken[j]])
+            value = np.float64(gram[taken[i], taken[j]]) + (ridge if i == j else 0.0)
             for k in range(j):
                 value -= factor[i, k] * factor[j, k]
             factor[i, j] = np.sqrt(value) if i == j else value / factor[j, j]

@@ -33,7 +33,7 @@ SHAPES = tuple((a, b) for a in range(HALVINGS + 1) for b in range(HALVINGS + 1) 
 """Of texels offered: halvings across and down, from the window's."""
 ALIGNED = 1 << HALVINGS
 SIDE = 3 * ALIGNED  # texels along a window
-BINS = 2  # places along one of them to which rays are rounded
+BINS = 4  # places along one of them to which rays are rounded
 ROOM = SIDE - ALIGNED + 1  # texels that rays may span, wherever they are
 POINTS = 4  # along a texel's side that stand for its area
 MOST = 40  # texels of a pixel
@@ -43,6 +43,7 @@ SHRUNK = 4
 """Times that the photographs are shrunk whose statistics are taken: sharp images have more of what is fine."""
 NEGATIVE = 0.45
 """What weights below 0 may add up to: sums of bytes have room for it, and a spot of light leaves no dark rings."""
+RIDGE, RIDGE_GROWS = 0.5, 2.0  # square gray levels that a square sum of weights of 1 costs where they add up to more
 FRESH = 1e-4  # part of a texel's variance that must be news after those taken before
 SCREENED, OFFERED = 12, 256
 """After so many texels of a pixel only so many others, those worth most then, are offered to it."""
@@ -80,22 +81,19 @@ class Pursuit:
     def taps(self, x: Array, y: Array, weights: Array) -> Taps:
         """Texels of M pixels for rays at x, y, (K, M) float32 each, in the image, K a square, of weights (K, M).
 
-        Pixels that see several places far apart, or that would need weights far below 0, get those of the tree.
+        Pixels that see several places far apart get those of the tree.
         """
         steps, span = steps_between(x, y, weights), span_of(x, y, weights)
         able = np.flatnonzero((self.level(span) >= 0) & ~self.tree.is_loose(span, steps, weights))
         low = np.stack([ends_of(at, weights)[0] for at in (x, y)])[:, able]
         rays = [columns[:, able] for columns in (x, y, weights)]
         chosen = self._choose(rays[0], rays[1], rays[2], of_some(steps, able), low, span[able])
-        good = np.minimum(chosen.weight, 0).sum(1) >= -NEGATIVE
-        able = able[good]
         rest = np.ones(len(span), dtype=np.bool_)
         rest[able] = False
         tree = self.tree.taps(x[:, rest], y[:, rest], weights[:, rest])
-        counts = chosen.counts[good]
-        there = np.arange(MOST) < counts[:, None]
-        pixel = np.repeat(np.arange(len(able)), counts)
-        taps = whole(pixel, chosen.texel[good][there], chosen.weight[good][there], len(able), np.zeros(len(able)))
+        there = np.arange(MOST) < chosen.counts[:, None]
+        pixel = np.repeat(np.arange(len(able)), chosen.counts)
+        taps = whole(pixel, chosen.texel[there], chosen.weight[there], len(able), np.zeros(len(able)))
         return mixed(~rest, tree, taps)
 
     def _choose(self, x: Array, y: Array, weights: Array, steps: Steps, low: Array, span: Array) -> _Chosen:
@@ -135,7 +133,7 @@ class Pursuit:
         offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
         taken, counts = _taken(words, along, offered, self._prices(level))
-        weight = _weights(words, along, taken, counts, share.sum(1, dtype=np.float64))
+        weight = _gentle(words, along, taken, counts, share.sum(1, dtype=np.float64))
         texel = np.take_along_axis(numbers, taken, 1)
         return _Chosen(texel, weight, counts)
 
@@ -149,8 +147,8 @@ class Pursuit:
         shapes = np.array([(*shape, *self._limits(level, shape)) for shape in SHAPES], dtype=np.int64)
         least = np.float32(FRESH) * np.diag(words.gram)
         choose(
-            words.lags, words.gram, _atoms(), shapes, self._prices(level), least, SCREENED, OFFERED, first, where,
-            share, _boxes(where, share), texel, weight, counts,
+            words.lags, words.gram, _atoms(), shapes, self._prices(level), least, SCREENED, OFFERED, NEGATIVE,
+            RIDGE, RIDGE_GROWS, first, where, share, _boxes(where, share), texel, weight, counts,
         )  # fmt: skip
         return _Chosen(texel, weight, counts)
 
@@ -320,14 +318,27 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple
     return taken, counts
 
 
-def _weights(words: _Dictionary, along: Array, taken: Indices, counts: Indices, total: Array) -> Array:
-    """The best weights, (M, MOST), of those that add up to `total`, (M,)."""
+def _weights(
+    words: _Dictionary, along: Array, taken: Indices, counts: Indices, total: Array, ridge: float = 0.0
+) -> Array:
+    """The best weights, (M, MOST), of those that add up to `total`, (M,); ridge: what their square sum costs."""
     found: Array = np.zeros(taken.shape)
     for count in np.unique(counts[counts > 0]).tolist():
         rows = np.flatnonzero(counts == count)
         some = taken[rows, :count]
-        gram = words.gram[some[:, :, None], some[:, None]].astype(np.float64)
+        gram = words.gram[some[:, :, None], some[:, None]] + ridge * np.eye(count)
         given = np.stack([np.take_along_axis(along[rows], some, 1), np.ones(some.shape)], -1)
         free, even = np.moveaxis(np.linalg.solve(gram, given), -1, 0)
         found[rows, :count] = free + even * ((total[rows] - free.sum(1)) / even.sum(1))[:, None]
     return found
+
+
+def _gentle(words: _Dictionary, along: Array, taken: Indices, counts: Indices, total: Array) -> Array:
+    """The same, drawn towards even ones where those below 0 add up to too much."""
+    weight, ridge = _weights(words, along, taken, counts, total), RIDGE
+    while True:
+        rows = np.flatnonzero(np.minimum(weight, 0).sum(1) < -NEGATIVE)
+        if not rows.size:
+            return weight
+        weight[rows] = _weights(words, along[rows], taken[rows], counts[rows], total[rows], ridge)
+        ridge *= RIDGE_GROWS

@@ -91,7 +91,7 @@ def test_weights_are_the_best_ones():
     taps = pursuit().taps(x, y, even(x))
     steps = steps_between(x, y, even(x))
     firsts, shapes = np.array(copy_starts(SIZE)), copies(SIZE)
-    last = 0
+    last = free = 0
     for pixel, count in enumerate(taps.counts):
         some = slice(last, last + count)
         last += count
@@ -117,8 +117,12 @@ def test_weights_are_the_best_ones():
             return float(of_all @ covariance @ of_all)
 
         ours = square(taps.weights[some] / UNIT)
+        if np.minimum(best, 0).sum() < -0.4:  # more than there is room for
+            continue
+        free += 1
         assert ours <= 1.15 * square(best) + 0.02  # places rounded to half a texel, weights to 1/4096
         assert ours < 0.9 * square(np.full(count, 1 / count))
+    assert free >= 9
 
 
 @settings(max_examples=20, deadline=None)
