@@ -13,10 +13,31 @@ from .prefetch import to_read, to_write
 
 U = np.uint64
 ONE = U(EVERY)
-AHEAD = 256
+FOUR = 4
+AHEAD = FOUR * 64
 """Taps that are fetched before they are needed: tables are larger than the caches, and what rows look at is not where
-what the rows before looked at is. There must be so many places more than taps."""
+what the rows before looked at is. There must be so many more than are used."""
 ROWS_AHEAD = U(24)
+
+
+@compiled
+def interleave(counts: Any, places: Any, texels: Any, weights: Any, bits: int, most: Any, taps: Any) -> None:
+    """Write the taps of four rows, in turn, the first of each, the second of each, ...; weights of 0 fill up.
+
+    counts: (M,), texels, weights: (T,) of rows. places: (N,) of each texel. most: (ceil(M / 4),) the largest of four
+    counts, by which `taps`, signed, are long: a weight, and in so many lowest bits its place.
+    """
+    rows, tap, first = U(len(counts)), U(0), U(0)
+    taps[:] = 0
+    for four in range(U(len(most))):
+        for lane in range(U(FOUR)):
+            row = four * U(FOUR) + lane
+            if row < rows:
+                for each in range(U(counts[row])):
+                    place = np.int64(places[U(texels[tap])])
+                    taps[first + each * U(FOUR) + lane] = (np.int64(weights[tap]) << bits) | place
+                    tap += U(1)
+        first += U(most[four]) * U(FOUR)
 
 
 @compiled
@@ -31,38 +52,53 @@ def _clipped(word: Any) -> Any:
 
 @compiled
 def sum_words(
-    out: Any, below: Any, first: int, channels: int, words: Any, shift: int, pixels: Any, counts: Any, places: Any,
-    weights: Any, roundings: Any, clear: Any,
+    out: Any, below: Any, first: int, channels: int, words: Any, shift: int, bits: int, pixels: Any, most: Any,
+    taps: Any, roundings: Any, clear: Any,
 ) -> None:  # fmt: skip
     """Write some channels of pixels: sums of words times weights, + clear x the pixel of `below`.
 
     out, below: (P, C) uint8; first, channels: which of them, at most three. words: (N,) uint64. shift: bits of a
-    weight's unit. pixels, counts: (M,) uint32. places: (T + AHEAD,) uint32 of words. weights: (T,) int16. roundings,
-    clear: (M,) uint32, uint16, units of weights; the first for every channel, with `BELOW` gray levels in it.
+    weight's unit. pixels: (M,) uint32. bits, most, taps: as `interleave` writes them, and `AHEAD` taps more.
+    roundings, clear: (M,) uint32, uint16, units of weights; the first for every channel, with `BELOW` in it.
     """
-    start, middle, last, flat = U(first), U(first + 1), U(first + 2), out.ravel()
-    tap, rows = U(0), U(len(pixels))
-    for row in range(rows):
-        to_write(flat, U(pixels[min(row + ROWS_AHEAD, rows - U(1))]) * U(out.shape[1]))
-        pixel = U(pixels[row])
-        total = ONE * U(roundings[row])
-        for each in range(tap, tap + U(counts[row])):
-            to_read(words, U(places[each + U(AHEAD)]))
-            total += words[places[each]] * U(np.int64(weights[each]))
-        tap += U(counts[row])
-        if clear[row]:
-            own = U(below[pixel, start])
+    start, middle, last = U(first), U(first + 1), U(first + 2)
+    flat, mask = out.ravel(), (U(1) << U(bits)) - U(1)
+    tap, end = U(0), U(len(pixels)) - U(1)
+    for four in range(U(len(most))):
+        row = four * U(FOUR)
+        for lane in range(U(FOUR)):
+            to_write(flat, U(pixels[min(row + ROWS_AHEAD + lane, end)]) * U(out.shape[1]))
+        a, b, c, d = U(0), U(0), U(0), U(0)
+        for _ in range(U(most[four])):
+            to_read(words, U(np.int64(taps[tap + U(AHEAD)])) & mask)
+            to_read(words, U(np.int64(taps[tap + U(AHEAD + 1)])) & mask)
+            to_read(words, U(np.int64(taps[tap + U(AHEAD + 2)])) & mask)
+            to_read(words, U(np.int64(taps[tap + U(AHEAD + 3)])) & mask)
+            v, w, x, y = taps[tap], taps[tap + U(1)], taps[tap + U(2)], taps[tap + U(3)]
+            a += words[U(np.int64(v)) & mask] * U(np.int64(v >> bits))
+            b += words[U(np.int64(w)) & mask] * U(np.int64(w >> bits))
+            c += words[U(np.int64(x)) & mask] * U(np.int64(x >> bits))
+            d += words[U(np.int64(y)) & mask] * U(np.int64(y >> bits))
+            tap += U(FOUR)
+        for own in (a, b, c, d):
+            if row > end:
+                break
+            pixel = U(pixels[row])
+            total = own + ONE * U(roundings[row])
+            if clear[row]:
+                beneath = U(below[pixel, start])
+                if channels > 1:
+                    beneath |= U(below[pixel, middle]) << U(FIELD)
+                if channels > 2:
+                    beneath |= U(below[pixel, last]) << U(2 * FIELD)
+                total += beneath * U(clear[row])
+            total = _clipped(total >> U(shift))
+            out[pixel, start] = np.uint8(total & U(255))
             if channels > 1:
-                own |= U(below[pixel, middle]) << U(FIELD)
+                out[pixel, middle] = np.uint8((total >> U(FIELD)) & U(255))
             if channels > 2:
-                own |= U(below[pixel, last]) << U(2 * FIELD)
-            total += own * U(clear[row])
-        total = _clipped(total >> U(shift))
-        out[pixel, start] = np.uint8(total & U(255))
-        if channels > 1:
-            out[pixel, middle] = np.uint8((total >> U(FIELD)) & U(255))
-        if channels > 2:
-            out[pixel, last] = np.uint8((total >> U(2 * FIELD)) & U(255))
+                out[pixel, last] = np.uint8((total >> U(2 * FIELD)) & U(255))
+            row += U(1)
 
 
 @compiled

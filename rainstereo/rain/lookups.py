@@ -21,7 +21,7 @@ from rainstereo.types import Array, Indices, Mask
 
 from .quadtree import Taps
 
-JOINED = 1 << 22  # taps up to which tables are joined
+JOINED = 1 << 20  # taps up to which tables are joined: both stand in memory meanwhile
 ROWS = 1 << 14  # that are moved at a time
 TILE = 64  # pixels of the scene
 BITS = 10  # of the number of a tile, along an axis
@@ -57,14 +57,14 @@ class Lookups:
         )  # fmt: skip
 
     @classmethod
-    def joined(cls, parts: list[Lookups]) -> list[Lookups]:
-        """The same in few tables; empties the list, to spare memory."""
+    def joined(cls, parts: list[Lookups], most: int = JOINED) -> list[Lookups]:
+        """The same in few tables, of so many taps at most; empties the list, to spare memory."""
         tables: list[Lookups] = []
         parts.reverse()
         while parts:
             same = [parts.pop()]
             taps = len(same[0].texels)
-            while parts and taps + len(parts[-1].texels) <= JOINED:
+            while parts and taps + len(parts[-1].texels) <= most:
                 same.append(parts.pop())
                 taps += len(same[-1].texels)
             tables.append(same[0] if len(same) == 1 else _joined(same))

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rainstereo import compiled
-from rainstereo.types import Image, Indices
+from rainstereo.types import Image
 
 from .lookups import Lookups
 from .pyramid import copies, copy_starts
@@ -27,7 +27,7 @@ from .words import BELOW, EVERY, PACKED, clip, packed, unpack
 
 SHIFT = UNIT.bit_length() - 1
 KEPT = 1 << 24  # taps up to which places of texels are kept
-AHEAD = 256  # at least that of `compiled.sums`
+SHORT, LONG = 20, 32  # bits of a place where a tap has 32 bits, and where it has 64
 MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
 ROWS = 1 << 14  # that are summed at a time: few enough for the caches
 DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black
@@ -42,14 +42,13 @@ class Piece:
     rows: slice
     taps: slice
 
-    def cut(self) -> Iterator[tuple[Piece, slice]]:
-        """The same in parts of `ROWS` rows, and each part's taps among those of this."""
+    def cut(self, rows: int) -> Iterator[Piece]:
+        """The same in parts of so many rows."""
         ends = np.concatenate([[0], np.cumsum(self.table.counts[self.rows], dtype=np.int64)])
-        cuts = [*range(0, len(ends) - 1, ROWS), len(ends) - 1]
+        cuts = [*range(0, len(ends) - 1, rows), len(ends) - 1]
         for a, b in pairwise(cuts):
-            own, first, before = slice(int(ends[a]), int(ends[b])), self.taps.start, self.rows.start
-            taps = slice(own.start + first, own.stop + first)
-            yield Piece(self.number, self.table, slice(before + a, before + b), taps), own
+            taps = slice(self.taps.start + int(ends[a]), self.taps.start + int(ends[b]))
+            yield Piece(self.number, self.table, slice(self.rows.start + a, self.rows.start + b), taps)
 
     def matrix(self, kind: type, places: Any, columns: int) -> Any:
         """As a sparse matrix. places: of the texels of its taps, among so many (columns)."""
@@ -101,12 +100,11 @@ class Paste:
         from rainstereo.compiled.sums import sum_words
 
         channels = part.stop - part.start
-        for piece, places in self._placed:
-            table, rows = piece.table, piece.rows
+        for piece, most, taps in self._fours:
+            rows = piece.rows
             sum_words(
-                out, below, part.start, channels, words, SHIFT, table.pixels[rows].view(np.uint32),
-                table.counts[rows].view(np.uint32), places, table.weights[piece.taps],
-                self._roundings[piece.number][rows], self._clear[piece.number][rows],
+                out, below, part.start, channels, words, SHIFT, self._bits, piece.table.pixels[rows].view(np.uint32),
+                most, taps, self._roundings[piece.number][rows], self._clear[piece.number][rows],
             )  # fmt: skip
 
     def _products(self, words: Any, below: Image, out: Image, part: slice) -> None:
@@ -129,8 +127,8 @@ class Paste:
         """Sums of anything else, in single precision."""
         values: Image = np.empty((self._needed.ends[-1], out.shape[1]), dtype=np.float32)
         self._needed.put_numbers(levels, values)
-        for piece, total in self._totals(values):
-            total *= np.float32(1 / UNIT)
+        for piece, of_units in self._totals(values):
+            total = np.multiply(of_units, np.float32(1 / UNIT), out=of_units)
             pixels, clear = piece.table.pixels[piece.rows], piece.table.clear[piece.rows]
             soft = np.flatnonzero(clear)
             total[soft] += below[pixels[soft]] * clear[soft, None]
@@ -145,21 +143,16 @@ class Paste:
         from rainstereo.compiled.sums import sum_numbers
 
         for piece, places in self._placed:
-            for some, taps in piece.cut():
-                total: Image = np.empty((some.rows.stop - some.rows.start, values.shape[1]), dtype=np.float32)
-                counts = some.table.counts[some.rows].view(np.uint32)
-                sum_numbers(total, values, counts, places[taps], some.table.weights[some.taps])
-                yield some, total
+            total: Image = np.empty((piece.rows.stop - piece.rows.start, values.shape[1]), dtype=np.float32)
+            counts = piece.table.counts[piece.rows].view(np.uint32)
+            sum_numbers(total, values, counts, places, piece.table.weights[piece.taps])
+            yield piece, total
 
     def _each(self, kind: type) -> Iterator[tuple[Piece, Any]]:
         """Each piece and its matrix."""
         found = self._matrices.get(kind)
         if found is None:
-            found = (
-                (some, some.matrix(kind, places[taps], self._needed.ends[-1]))
-                for piece, places in self._placed
-                for some, taps in piece.cut()
-            )
+            found = ((piece, piece.matrix(kind, places, self._needed.ends[-1])) for piece, places in self._placed)
             if self.taps <= MATRICES:
                 found = self._matrices[kind] = list(found)
         yield from found
@@ -167,17 +160,37 @@ class Paste:
     # -- found once ----------------------------------------------------------------------------------------------------
 
     @property
-    def _placed(self) -> Iterable[tuple[Piece, Any]]:
-        """Pieces, and the places of their texels, `_at`: whole tables, or, to spare memory, parts of them."""
-        return self._kept if self.taps <= KEPT else self._in_parts()
+    def _placed(self) -> Iterator[tuple[Piece, Any]]:
+        """Parts of the tables, and the places of their texels, (T,) uint32."""
+        for piece in self._wholes:
+            for some in piece.cut(ROWS):
+                yield some, self._places[some.table.texels[some.taps]]
+
+    @property
+    def _fours(self) -> Iterable[tuple[Piece, Any, Any]]:
+        """Pieces, and their taps, four rows' together: whole tables, or, to spare memory, parts of them."""
+        if self.taps <= KEPT:
+            return self._kept
+        return (self._in_fours(some) for piece in self._wholes for some in piece.cut(ROWS))
 
     @cached_property
-    def _kept(self) -> list[tuple[Piece, Any]]:
-        places = self._needed.places()
-        return [(piece, _at(places, piece)) for piece in self._wholes]
+    def _kept(self) -> list[tuple[Piece, Any, Any]]:
+        return [self._in_fours(piece) for piece in self._wholes]
 
-    def _in_parts(self) -> Iterator[tuple[Piece, Any]]:
-        yield from ((some, _at(self._places, some)) for piece in self._wholes for some, _ in piece.cut())
+    def _in_fours(self, piece: Piece) -> tuple[Piece, Any, Any]:
+        from rainstereo.compiled.sums import AHEAD, FOUR, interleave
+
+        table, counts = piece.table, piece.table.counts[piece.rows]
+        most = np.maximum.reduceat(counts, np.arange(0, len(counts), FOUR))
+        long = FOUR * int(most.sum(dtype=np.int64)) + AHEAD
+        taps = np.empty(long, dtype=np.int32 if self._bits <= SHORT else np.int64)
+        interleave(counts, self._places, table.texels[piece.taps], table.weights[piece.taps], self._bits, most, taps)
+        return piece, most, taps
+
+    @cached_property
+    def _bits(self) -> int:
+        """Of a place among the texels."""
+        return SHORT if self._needed.ends[-1] <= 1 << SHORT else LONG
 
     @cached_property
     def _places(self) -> Any:
@@ -208,21 +221,15 @@ class Paste:
             np.rint(np.array([c.bias for c in copies(self.size)]) * UNIT), np.diff(copy_starts(self.size))
         ).astype(np.int16)
         found: list[list[Any]] = [[np.zeros(0, dtype=np.uint32)] for _ in self.tables]
-        for piece in (some for whole in self._wholes for some, _ in whole.cut()):  # whole tables take hundreds of MB
+        for piece in (
+            some for whole in self._wholes for some in whole.cut(ROWS // 8)
+        ):  # whole tables take hundreds of MB
             table, counts = piece.table, piece.table.counts[piece.rows]
             of_taps = table.weights[piece.taps] * of_copy[table.texels[piece.taps]].astype(np.int64)
             so_far, ends = np.concatenate([[0], np.cumsum(of_taps)]), np.cumsum(counts)
             shift = np.clip((so_far[ends] - so_far[ends - counts]) / UNIT**2, -DARKEST, DARKEST)
             found[piece.number].append(np.floor((BELOW + 0.5 - shift) * UNIT).astype(np.uint32))
         return [np.concatenate(parts) for parts in found]
-
-
-def _at(places: Any, piece: Piece) -> Any:
-    """Places of a piece's texels, (T + `AHEAD`,) uint32: some more, which loops may look at but not use."""
-    texels = piece.table.texels[piece.taps]
-    found = np.zeros(len(texels) + AHEAD, dtype=np.uint32)
-    np.take(places, texels, out=found[: len(texels)])
-    return found
 
 
 def _as_one(values: Image) -> Any:

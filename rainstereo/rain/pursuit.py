@@ -236,7 +236,7 @@ def _dictionary(level: int) -> _Dictionary:
 
 
 def _common(words: _Dictionary, where: Indices, share: Image) -> Image:
-    """Covariances of pixels with the texels of a window, (M, side^2). where, share: (M, K) places and weights of rays."""
+    """Covariances of pixels with the texels of a window, (M, side^2). where, share: (M, K) of rays."""
     ends = np.arange(0, where.size + 1, where.shape[1])
     matrix = csr_array((share.ravel(), where.ravel(), ends), shape=(len(where), (SIDE * BINS) ** 2))
     return np.asarray(matrix @ words.of_bins)

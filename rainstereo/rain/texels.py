@@ -46,10 +46,12 @@ class Texels:
         number = {(copy.across, copy.down): i for i, copy in enumerate(every)}
         count = [np.count_nonzero(used[a:b]) for a, b in pairwise(starts)]
         oblong: set[int] = set()
-        for i in np.flatnonzero(count).tolist():
-            while i >= levels and i not in oblong:
+        waiting = np.flatnonzero(count).tolist()
+        while waiting:
+            i = waiting.pop()
+            if i >= levels and i not in oblong:
                 oblong.add(i)
-                i = number[_parent(every[i])]
+                waiting.append(number[_parent(every[i])])
         fixed = [min(every[i].across, every[i].down) for i in oblong]
         last = max([k for k in range(levels) if count[k]] + fixed, default=-1)
         many = [k for k in range(last + 1) if count[k] >= SPARSE * every[k].width * every[k].height]
