@@ -84,7 +84,7 @@ def choose(
                 rest[i] -= gone * own
                 left = news[i] - own * own
                 news[i] = left if left > low[i] else FAR
-        total = 0.0
+        total: Any = 0.0
         for ray in range(rays):
             total += np.float64(share[pixel, ray])
         toll = 0.0
@@ -148,7 +148,7 @@ def add(common: Any, shapes: Any, along: Any) -> None:
     made = side * side
     for shape in range(U(1), U(len(shapes))):
         across, down = shapes[shape, U(0)] - shapes[U(0), U(0)], shapes[shape, U(1)] - shapes[U(0), U(1)]
-        start, given, wide = U(0), -1, True
+        start, given, wide = U(0), np.int64(-1), True
         for other in range(shape):  # the one that is half as wide, else the one that is half as high
             own_across, own_down = shapes[other, U(0)], shapes[other, U(1)]
             if own_across == across - 1 and own_down == down:
@@ -171,7 +171,7 @@ def add(common: Any, shapes: Any, along: Any) -> None:
 
 @compiled
 def screen(
-    score: Any, fewer: int, number: int, there: int, rest: Any, news: Any, cost: Any, low: Any, columns: Any, bases: Any
+    score: Any, fewer: Any, number: Any, there: Any, rest: Any, news: Any, cost: Any, low: Any, columns: Any, bases: Any
 ) -> Any:
     """Keep the texels of the highest scores, in order; of equal ones the first."""
     bound = np.partition(score[:there], there - fewer)[there - fewer]
@@ -191,7 +191,7 @@ def screen(
 
 
 @compiled
-def solve(gram: Any, along: Any, taken: Any, count: int, total: float, ridge: float, weight: Any) -> None:
+def solve(gram: Any, along: Any, taken: Any, count: Any, total: float, ridge: float, weight: Any) -> None:
     """Write the best weights of those that add up to a total, by Cholesky's factors; ridge: what their squares cost."""
     factor = np.empty((count, count), np.float64)
     free, even = np.empty(count, np.float64), np.empty(count, np.float64)

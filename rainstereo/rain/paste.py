@@ -150,12 +150,14 @@ class Paste:
 
     def _each(self, kind: type) -> Iterator[tuple[Piece, Any]]:
         """Each piece and its matrix."""
-        found = self._matrices.get(kind)
-        if found is None:
+        kept = self._matrices.get(kind)
+        if kept is None:
             found = ((piece, piece.matrix(kind, places, self._needed.ends[-1])) for piece, places in self._placed)
-            if self.taps <= MATRICES:
-                found = self._matrices[kind] = list(found)
-        yield from found
+            if self.taps > MATRICES:
+                yield from found
+                return
+            kept = self._matrices[kind] = list(found)
+        yield from kept
 
     # -- found once ----------------------------------------------------------------------------------------------------
 

@@ -186,7 +186,7 @@ def _atoms() -> Indices:
     for number, (across, down) in enumerate(SHAPES):
         i, j = np.mgrid[: SIDE >> down, : SIDE >> across]
         found.append(np.stack([np.full(i.size, number), j.ravel(), i.ravel()], -1))
-    return np.concatenate(found).astype(np.intp)
+    return np.asarray(np.concatenate(found), dtype=np.intp)
 
 
 def _boxes(where: Indices, share: Array) -> Indices:
@@ -213,7 +213,7 @@ class _Dictionary:
         place, cell = np.arange(SIDE * BINS), np.arange(SIDE)
         odd, step = place % BINS, SIDE - 1 - place[:, None] // BINS + cell
         table = self.lags[odd[:, None, None, None], odd[:, None, None], step[:, None, :, None], step[None, :, None]]
-        return table.reshape(len(place) ** 2, SIDE**2)
+        return np.asarray(table.reshape(len(place) ** 2, SIDE**2))
 
 
 @cache
