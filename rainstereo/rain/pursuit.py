@@ -8,8 +8,8 @@ best ones, as long as it falls by `worth` for each: orthogonal least squares (S.
 with a field's covariance for the inner product. Weights can be negative: a large texel less what it has too much.
 
 The texels offered are those of a window of `SIDE` x `SIDE` in the finest level in which it holds all of the pixel's
-rays, and the coarser ones there, of which some are twice as wide as high or the reverse (`pyramid.copies`). What they
-have in common with one another depends on the level alone, and is tabulated.
+rays, and the coarser ones there, of which some are up to four times as wide as high or the reverse (`pyramid.copies`).
+What they have in common with one another depends on the level alone, and is tabulated.
 """
 
 from __future__ import annotations
