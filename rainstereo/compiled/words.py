@@ -54,19 +54,24 @@ def average(words: Any, copies: Any) -> None:
         given, made = U(copies[each, U(1)]), U(copies[each, U(4)])
         across = U(1) if how == ROWS else U(2)
         down = U(1) if how == COLUMNS else U(2)
+        pairs = width // across
         for i in range(U(0), height, down):
-            above = given + i * width
-            below = above + width if down == U(2) and i + U(1) < height else above
-            for j in range(U(0), width - width % across, across):
-                if how == QUARTERS:
-                    total = words[above + j] + words[above + j + U(1)] + words[below + j] + words[below + j + U(1)]
-                    words[made] = ((total + QUARTER) >> U(2)) & BYTES
-                elif how == COLUMNS:
-                    words[made] = ((words[above + j] + words[above + j + U(1)] + HALF) >> U(1)) & BYTES
-                else:
-                    words[made] = ((words[above + j] + words[below + j] + HALF) >> U(1)) & BYTES
-                made += U(1)
+            start = given + i * width
+            above, below = words[start : start + width], words[start : start + width]
+            if down == U(2) and i + U(1) < height:
+                below = words[start + width : start + width + width]
+            line = words[made : made + pairs]
+            if how == QUARTERS:
+                for j in range(pairs):
+                    left, right = j + j, j + j + U(1)
+                    line[j] = ((above[left] + above[right] + below[left] + below[right] + QUARTER) >> U(2)) & BYTES
+            elif how == COLUMNS:
+                for j in range(pairs):
+                    line[j] = ((above[j + j] + above[j + j + U(1)] + HALF) >> U(1)) & BYTES
+            else:
+                for j in range(pairs):
+                    line[j] = ((above[j] + below[j] + HALF) >> U(1)) & BYTES
+            made += pairs
             if width % across:
-                one, other = words[above + width - U(1)], words[below + width - U(1)]
-                words[made] = ((one + other + HALF) >> U(1)) & BYTES
+                words[made] = ((above[width - U(1)] + below[width - U(1)] + HALF) >> U(1)) & BYTES
                 made += U(1)
