@@ -24,7 +24,7 @@ class PasteMoving:
         self.soft = self.looks.soft
 
     def paste(self, scene: Image, below: Image, out: Image) -> None:
-        """Write the pixels of a frame; see `lookups.Paste.paste`. `out` holds the clear image."""
+        """Write the pixels of a frame; see `paste.Paste.paste`. `out` holds the clear image."""
         if self.looks.tables:
             self.looks.paste(scene, below, out)
         if not self.caps:
