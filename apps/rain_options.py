@@ -91,7 +91,8 @@ class Options:
     motion: MotionKind | None = None
     """Of drops in sequences and videos: physical (default), the paper's rule, or still."""
     quick: bool = False
-    """For sequences and videos whose sharp drops mostly move: one ray a pixel, off by 4 gray levels or so."""
+    """For sequences and videos whose sharp drops mostly move: traced for each frame, off by 2 gray levels or so with
+    numba (the extra `fast`), and by 4 without."""
     refill_s: float = 5.0
     """Seconds in which as many drops fall on a sequence's pane as are there at the start; inf: none fall."""
     fps: float | None = None

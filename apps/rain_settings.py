@@ -35,7 +35,7 @@ class Rain:
     share: of the heaviest rain's drops, for all images, in place of both; see `over_set`.
     listed: a drop list to be rendered on all images in place of everything else.
     merge: whether drops that touch become one body on images, too.
-    quick: whether sharp drops are traced with one ray a pixel, for a few gray levels.
+    quick: whether sharp drops are taken to move (`Renderer.moving`): traced for each frame, for a few gray levels.
     """
 
     setup: Setup

@@ -87,7 +87,7 @@ class PasteLooks:
         self.soft = np.flatnonzero(np.concatenate([np.zeros(0, np.float32), *(t.clear for t in self.tables)]))
 
     def paste(self, scene: Image, below: Image, out: Image) -> None:
-        """Write the pixels of a frame; see `lookups.Paste.paste`."""
+        """Write the pixels of a frame; see `paste.Paste.paste`."""
         coarse = copies(scene) if any(not table.fine and len(table.place) for table in self.tables) else scene
         for table in self.tables:
             for first in range(0, len(table.pixels), TOGETHER):

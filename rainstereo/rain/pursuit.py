@@ -8,29 +8,32 @@ best ones, as long as it falls by `worth` for each: orthogonal least squares (S.
 with a field's covariance for the inner product. Weights can be negative: a large texel less what it has too much.
 
 The texels offered are those of a window of `SIDE` x `SIDE` in the finest level in which it holds all of the pixel's
-rays, and the coarser ones there, of which some are twice as wide as high or the reverse (`pyramid.copies`). What they
-have in common with one another depends on the level alone, and is tabulated.
+rays, and the coarser ones there, of which some are up to four times as wide as high or the reverse (`pyramid.copies`).
+What they have in common with one another depends on the level alone, and is tabulated.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
+from rainstereo import compiled
 from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.types import Array, Image, Indices, Mask
 
-from .pyramid import Copy, copies, copy_starts, sizes
+from .pyramid import LONG, Copy, copies, copy_starts, sizes
 from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, steps_between, whole
 
-SHAPES = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 1), (1, 2), (2, 2))
+HALVINGS = 3
+SHAPES = tuple((a, b) for a in range(HALVINGS + 1) for b in range(HALVINGS + 1) if abs(a - b) <= LONG)
 """Of texels offered: halvings across and down, from the window's."""
-SIDE = 20  # texels along a window
-BINS = 2  # places along one of them to which rays are rounded
-ALIGNED = 4
+ALIGNED = 1 << HALVINGS
+SIDE = 3 * ALIGNED  # texels along a window
+BINS = 4  # places along one of them to which rays are rounded
 ROOM = SIDE - ALIGNED + 1  # texels that rays may span, wherever they are
 POINTS = 4  # along a texel's side that stand for its area
 MOST = 40  # texels of a pixel
@@ -40,14 +43,16 @@ SHRUNK = 4
 """Times that the photographs are shrunk whose statistics are taken: sharp images have more of what is fine."""
 NEGATIVE = 0.45
 """What weights below 0 may add up to: sums of bytes have room for it, and a spot of light leaves no dark rings."""
+RIDGE, RIDGE_GROWS = 0.5, 2.0  # square gray levels that a square sum of weights of 1 costs where they add up to more
 FRESH = 1e-4  # part of a texel's variance that must be news after those taken before
-SCREENED, OFFERED = 8, 256
+SCREENED, OFFERED = 12, 256
 """After so many texels of a pixel only so many others, those worth most then, are offered to it."""
 ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
 TOGETHER = 128  # pixels: few enough for the caches
+FEW, DEAR = 2, 1.5
+"""Levels below this have so many texels that making and finding them costs, too; what one of these counts for."""
+AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
 QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-FINEST, DEAR = 2, 1.0
-"""Levels below this have so many texels that making them ready for sums costs, too; what one of these counts for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,22 +81,19 @@ class Pursuit:
     def taps(self, x: Array, y: Array, weights: Array) -> Taps:
         """Texels of M pixels for rays at x, y, (K, M) float32 each, in the image, K a square, of weights (K, M).
 
-        Pixels that see several places far apart, or that would need weights far below 0, get those of the tree.
+        Pixels that see several places far apart get those of the tree.
         """
         steps, span = steps_between(x, y, weights), span_of(x, y, weights)
         able = np.flatnonzero((self.level(span) >= 0) & ~self.tree.is_loose(span, steps, weights))
         low = np.stack([ends_of(at, weights)[0] for at in (x, y)])[:, able]
         rays = [columns[:, able] for columns in (x, y, weights)]
         chosen = self._choose(rays[0], rays[1], rays[2], of_some(steps, able), low, span[able])
-        good = np.minimum(chosen.weight, 0).sum(1) >= -NEGATIVE
-        able = able[good]
         rest = np.ones(len(span), dtype=np.bool_)
         rest[able] = False
         tree = self.tree.taps(x[:, rest], y[:, rest], weights[:, rest])
-        counts = chosen.counts[good]
-        there = np.arange(MOST) < counts[:, None]
-        pixel = np.repeat(np.arange(len(able)), counts)
-        taps = whole(pixel, chosen.texel[good][there], chosen.weight[good][there], len(able), np.zeros(len(able)))
+        there = np.arange(MOST) < chosen.counts[:, None]
+        pixel = np.repeat(np.arange(len(able)), chosen.counts)
+        taps = whole(pixel, chosen.texel[there], chosen.weight[there], len(able), np.zeros(len(able)))
         return mixed(~rest, tree, taps)
 
     def _choose(self, x: Array, y: Array, weights: Array, steps: Steps, low: Array, span: Array) -> _Chosen:
@@ -123,51 +125,95 @@ class Pursuit:
             )
             j, i = (np.clip(at, 0, places - 1).astype(np.intp) for at in (j, i))
             bins[part] = i * places + j
-        rays = bins[0].size // count * len(QUARTERS)
-        where = np.moveaxis(bins, -1, 0).reshape(count, rays)
+        where = np.moveaxis(bins, -1, 0).reshape(count, -1)
         share = np.tile(np.float32(0.25) * weights.T, len(QUARTERS))
-        ends = np.arange(0, (count + 1) * rays, rays)
-        common = csr_array((share.ravel(), where.ravel(), ends), shape=(count, places**2)) @ words.of_bins
-        offered, numbers = self._offered(level, first)
+        if compiled.available():
+            return self._compiled(level, first, where, share)
+        common = _common(words, where, share)
+        offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
         taken, counts = _taken(words, along, offered, self._prices(level))
-        weight = _weights(words, along, taken, counts, weights.sum(0, dtype=np.float64))
+        weight = _gentle(words, along, taken, counts, share.sum(1, dtype=np.float64))
         texel = np.take_along_axis(numbers, taken, 1)
         return _Chosen(texel, weight, counts)
 
-    def _prices(self, level: int) -> Array:
-        """What each texel of a window must be worth, (A,)."""
-        price = []
-        for across, down in SHAPES:
-            fine = level + min(across, down) < FINEST
-            price.append(self.worth * (1.0 if not fine else DEAR if across == down else np.inf))
-        return np.repeat(price, [(SIDE >> shape[0]) * (SIDE >> shape[1]) for shape in SHAPES])
+    def _compiled(self, level: int, first: Indices, where: Indices, share: Image) -> _Chosen:
+        from rainstereo.compiled.pursuit import choose
 
-    def _offered(self, level: int, first: Indices) -> tuple[Mask, Indices]:
-        """Which texels of windows the image has, and their numbers, (M, A)."""
-        column, row = first
-        offered, numbers = [], []
-        at = {(copy.across, copy.down): (copy, start) for copy, start in self._copies}
-        for across, down in SHAPES:
-            copy, start = at.get((level + across, level + down), (Copy(0, 0, 0, 0), 0))
-            j = (column >> across)[:, None, None] + np.arange(SIDE >> across)
-            i = (row >> down)[:, None, None] + np.arange(SIDE >> down)[:, None]
-            offered.append(((j < copy.width) & (i < copy.height)).reshape(len(column), -1))
-            numbers.append((start + i * copy.width + j).reshape(len(column), -1))
-        return np.concatenate(offered, 1), np.concatenate(numbers, 1)
+        words, count = _dictionary(level), len(where)
+        texel: Indices = np.zeros((count, MOST), dtype=np.intp)
+        weight: Array = np.zeros((count, MOST))
+        counts: Indices = np.zeros(count, dtype=np.intp)
+        shapes = np.array([(*shape, *self._limits(level, shape)) for shape in SHAPES], dtype=np.int64)
+        least = np.float32(FRESH) * np.diag(words.gram)
+        choose(
+            words.lags, words.gram, _atoms(), shapes, self._prices(level), least, SCREENED, OFFERED, NEGATIVE,
+            RIDGE, RIDGE_GROWS, first, where, share, _boxes(where, share), texel, weight, counts,
+        )  # fmt: skip
+        return _Chosen(texel, weight, counts)
+
+    def _prices(self, level: int) -> Any:
+        """What each texel of a window must be worth, (A,) float32."""
+        dear = np.array([DEAR if level + min(shape) < FEW else 1.0 for shape in SHAPES])
+        return (self.worth * dear[_atoms()[:, 0]]).astype(np.float32)
+
+    def _limits(self, level: int, shape: tuple[int, int]) -> tuple[int, int, int]:
+        """Width and height of the copy that has texels of a shape, 0 if there is none, and the number of its first."""
+        copy, start = self._copies.get((level + shape[0], level + shape[1]), (Copy(0, 0, 0, 0), 0))
+        return copy.width, copy.height, start
+
+    def _offered(self, level: int, first: Indices, boxes: Indices) -> tuple[Mask, Indices]:
+        """Which texels of windows the image has and boxes meet, and their numbers, (M, A)."""
+        number, j, i = _atoms().T
+        across, down = np.array(SHAPES)[number].T
+        width, height, start = np.array([self._limits(level, shape) for shape in SHAPES])[number].T
+        x, y = (first[0][:, None] >> across) + j, (first[1][:, None] >> down) + i
+        left, right, top, bottom = boxes.T[:, :, None]
+        near = ((j << across) <= right) & (((j + 1) << across) > left)
+        near &= ((i << down) <= bottom) & (((i + 1) << down) > top)
+        return near & (x < width) & (y < height), start + y * width + x
 
     @cached_property
-    def _copies(self) -> list[tuple[Copy, int]]:
-        return list(zip(copies(self.size), copy_starts(self.size), strict=False))
+    def _copies(self) -> dict[tuple[int, int], tuple[Copy, int]]:
+        every = zip(copies(self.size), copy_starts(self.size), strict=False)
+        return {(copy.across, copy.down): (copy, start) for copy, start in every}
+
+
+@cache
+def _atoms() -> Indices:
+    """Of each texel offered, (A, 3), the number of its shape, its column and row among those of the shape."""
+    found = []
+    for number, (across, down) in enumerate(SHAPES):
+        i, j = np.mgrid[: SIDE >> down, : SIDE >> across]
+        found.append(np.stack([np.full(i.size, number), j.ravel(), i.ravel()], -1))
+    return np.asarray(np.concatenate(found), dtype=np.intp)
+
+
+def _boxes(where: Indices, share: Array) -> Indices:
+    """First and last column, first and last row, (M, 4), of the window's texels that rays meet, and one more around."""
+    lit, found = share > 0, []
+    for place in (where % (SIDE * BINS) // BINS, where // (SIDE * BINS) // BINS):
+        found += [np.where(lit, place, SIDE).min(1) - AROUND, np.where(lit, place, -1).max(1) + AROUND]
+    return np.stack(found, -1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Dictionary:
-    """What texels of a window have in common. of_bins: (bins, side^2) of places with the window's own texels. gram: (A,
-    A) of texels with one another. Square gray levels."""
+    """What texels of a window have in common. gram: (A, A) of texels with one another. Square gray levels.
 
-    of_bins: Array
-    gram: Array
+    lags: (2, 2, n, n) of a place with a texel so far away, even and odd steps of `BINS` apart; the last place first.
+    """
+
+    lags: Image
+    gram: Image
+
+    @cached_property
+    def of_bins(self) -> Image:
+        """(bins, side^2) of places with the window's own texels."""
+        place, cell = np.arange(SIDE * BINS), np.arange(SIDE)
+        odd, step = place % BINS, SIDE - 1 - place[:, None] // BINS + cell
+        table = self.lags[odd[:, None, None, None], odd[:, None, None], step[:, None, :, None], step[None, :, None]]
+        return np.asarray(table.reshape(len(place) ** 2, SIDE**2))
 
 
 @cache
@@ -176,19 +222,24 @@ def _dictionary(level: int) -> _Dictionary:
     points = min(POINTS, 2**level)
     inside = (np.arange(points) + 0.5) / points - 0.5
     inside = np.stack(np.meshgrid(inside, inside), -1).reshape(-1, 2)
-    every = np.arange(-(SIDE - 1) * BINS, SIDE * BINS)
-    away = (every + 0.5) / BINS - 0.5
-    of_bins = _covariance(scene, away, inside, texel)
+    away = (np.arange(-(SIDE - 1) * BINS, SIDE * BINS) + 0.5) / BINS - 0.5
+    of_places = _covariance(scene, away, inside, texel).astype(np.float32)
+    split = of_places.reshape(len(away) // BINS, BINS, len(away) // BINS, BINS)
+    lags = np.ascontiguousarray(np.moveaxis(split, (1, 3), (0, 1))[:, :, ::-1, ::-1])
     between = (inside[:, None] - inside).reshape(-1, 2)
     own = _covariance(scene, np.arange(1.0 - SIDE, SIDE), between, texel)
-    place, cell = np.arange(SIDE * BINS), np.arange(SIDE)
-    step = place[:, None] - BINS * cell + (SIDE - 1) * BINS  # of a bin and a texel, along an axis
-    table = of_bins[step[:, None, :, None], step[None, :, None, :]].reshape(len(place) ** 2, SIDE**2)
-    lag = cell[:, None] - cell + SIDE - 1
+    lag = np.arange(SIDE) - np.arange(SIDE)[:, None] + SIDE - 1
     base = own[lag[:, None, :, None], lag[None, :, None, :]].reshape(SIDE**2, SIDE**2)
     whole = _sums(base.reshape(-1, SIDE, SIDE))
     gram = _sums(np.ascontiguousarray(whole.T).reshape(-1, SIDE, SIDE))
-    return _Dictionary(table.astype(np.float32), gram.astype(np.float32))
+    return _Dictionary(lags, gram.astype(np.float32))
+
+
+def _common(words: _Dictionary, where: Indices, share: Image) -> Image:
+    """Covariances of pixels with the texels of a window, (M, side^2). where, share: (M, K) of rays."""
+    ends = np.arange(0, where.size + 1, where.shape[1])
+    matrix = csr_array((share.ravel(), where.ravel(), ends), shape=(len(where), (SIDE * BINS) ** 2))
+    return np.asarray(matrix @ words.of_bins)
 
 
 def _scene(level: int) -> SceneStatistics:
@@ -219,22 +270,20 @@ def _sums(values: Array) -> Array:
     return np.concatenate([found[shape].reshape(len(values), -1) for shape in SHAPES], 1)
 
 
-def _taken(words: _Dictionary, along: Array, offered: Mask, price: Array) -> tuple[Indices, Indices]:
+def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple[Indices, Indices]:
     """Numbers of texels taken, (M, MOST), and how many, (M,). along: (M, A) covariances with the pixels."""
-    count, variance = len(along), np.diag(words.gram)
-    gram = words.gram
+    gram, count, variance = words.gram, len(along), np.diag(words.gram)
     taken: Indices = np.zeros((count, MOST), dtype=np.intp)
     counts: Indices = np.zeros(count, dtype=np.intp)
     rows, every = np.arange(count), np.arange(count)
     columns: Indices = np.broadcast_to(np.arange(len(variance)), along.shape)
     rest: Image = along.astype(np.float32)
     news: Image = np.where(offered, variance, np.float32(np.inf))
-    cost, least = price.astype(np.float32), np.float32(FRESH) * variance
+    cost, least = price, np.float32(FRESH) * variance
     bases: Image = np.empty((MOST, *along.shape), dtype=np.float32)
     for number in range(MOST):
         score: Image = rest * rest
-        score /= news
-        score /= cost
+        score /= news * cost
         best = score.argmax(1)
         good = score[every, best] > (number > 0)  # the first is taken whatever it is worth: sums of weights are kept
         if number == SCREENED and len(variance) > OFFERED:
@@ -256,7 +305,7 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Array) -> tup
         chosen = columns[every, best]
         taken[rows[good], number] = chosen[good]
         counts[rows[good]] += 1
-        base = gram[chosen] if cost.ndim == 1 else gram[chosen[:, None], columns]
+        base = gram[chosen] if least.ndim == 1 else gram[chosen[:, None], columns]
         for before in bases[:number]:
             base -= before[every, best][:, None] * before
         base *= (1 / np.sqrt(news[every, best]))[:, None]
@@ -269,14 +318,27 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Array) -> tup
     return taken, counts
 
 
-def _weights(words: _Dictionary, along: Array, taken: Indices, counts: Indices, total: Array) -> Array:
-    """The best weights, (M, MOST), of those that add up to `total`, (M,)."""
+def _weights(
+    words: _Dictionary, along: Array, taken: Indices, counts: Indices, total: Array, ridge: float = 0.0
+) -> Array:
+    """The best weights, (M, MOST), of those that add up to `total`, (M,); ridge: what their square sum costs."""
     found: Array = np.zeros(taken.shape)
     for count in np.unique(counts[counts > 0]).tolist():
         rows = np.flatnonzero(counts == count)
         some = taken[rows, :count]
-        gram = words.gram[some[:, :, None], some[:, None]].astype(np.float64)
+        gram = words.gram[some[:, :, None], some[:, None]] + ridge * np.eye(count)
         given = np.stack([np.take_along_axis(along[rows], some, 1), np.ones(some.shape)], -1)
         free, even = np.moveaxis(np.linalg.solve(gram, given), -1, 0)
         found[rows, :count] = free + even * ((total[rows] - free.sum(1)) / even.sum(1))[:, None]
     return found
+
+
+def _gentle(words: _Dictionary, along: Array, taken: Indices, counts: Indices, total: Array) -> Array:
+    """The same, drawn towards even ones where those below 0 add up to too much."""
+    weight, ridge = _weights(words, along, taken, counts, total), RIDGE
+    while True:
+        rows = np.flatnonzero(np.minimum(weight, 0).sum(1) < -NEGATIVE)
+        if not rows.size:
+            return weight
+        weight[rows] = _weights(words, along[rows], taken[rows], counts[rows], total[rows], ridge)
+        ridge *= RIDGE_GROWS

@@ -18,6 +18,8 @@ from rainstereo.types import Array, Image
 SMALLEST = 4  # pixels along the shorter side
 BIAS = 0.125  # gray levels by which OpenCV's mean of four bytes is too large: it rounds halves up
 BIAS_OF_PAIRS = 0.25  # the same of means of two bytes, halves rounded up
+PAIRED = 2  # level from which there are copies that are wider than high: finer ones are dear to make
+LONG = 2  # times that they are twice as wide
 SHARP = 2  # level up to which a sharp image is as uneven as there
 ACROSS = 4  # points along a texel's side that stand for its area
 
@@ -47,15 +49,24 @@ class Copy:
     width: int
     height: int
 
+    @property
+    def bias(self) -> float:
+        """Gray levels by which its bytes are too large, in the mean."""
+        return BIAS * min(self.across, self.down) + BIAS_OF_PAIRS * abs(self.across - self.down)
+
 
 def copies(size: tuple[int, int]) -> list[Copy]:
-    """The levels; then, from each but the last, the means of its pairs of columns; then of its pairs of rows."""
-    levels = list(enumerate(sizes(size)))
-    return [
-        *(Copy(k, k, w, h) for k, (w, h) in levels),
-        *(Copy(k + 1, k, -(-w // 2), h) for k, (w, h) in levels[:-1]),
-        *(Copy(k, k + 1, w, -(-h // 2)) for k, (w, h) in levels[:-1]),
-    ]
+    """The levels; then, from each from `PAIRED` on, means of its pairs of columns, of its pairs of rows, and of fours.
+
+    So there are texels twice and four times as wide as high, and the reverse.
+    """
+    levels = sizes(size)
+    found = [Copy(k, k, *level) for k, level in enumerate(levels)]
+    for by in range(1, LONG + 1):
+        for k in range(PAIRED, len(levels) - by):
+            found.append(Copy(k + by, k, levels[k + by][0], levels[k][1]))
+            found.append(Copy(k, k + by, levels[k][0], levels[k + by][1]))
+    return found
 
 
 def copy_starts(size: tuple[int, int]) -> list[int]:

@@ -29,8 +29,9 @@ LOOSE = 2.5
 """Times the usual step between its rays, all along it, that a pixel's rays may span as one."""
 MERGES = 3
 ALIGNED = 1 << MERGES
-UNIT = 4096
-"""Of weights: whole numbers, so that three channels of a sum fit into one word (see `lookups`)."""
+UNIT = 1024
+"""Of weights: whole numbers, so that three channels of a sum fit into one word (see `words`), and that a weight and the
+place of its texel fit into 32 bits."""
 FEW, DEAR = 2, 2.0
 """Levels with so many texels that making them ready for sums costs as well, and what a tap of these counts for."""
 FINE = 1 << 24

@@ -17,6 +17,7 @@ import numpy as np
 
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
+from rainstereo.compiled import available
 from rainstereo.droplet import Drop, SphericalCap
 from rainstereo.layer import depth_of
 from rainstereo.patch import BORDERS
@@ -25,11 +26,15 @@ from rainstereo.types import Array, Image, Indices, Mask
 
 from . import drop_list, linear_light
 from .blurred import BlurredLayer, by_disc
+from .cap_tier import OWN, CapTiers, DropTier
 from .drops import Drops
-from .looks import Looks, PasteLooks
-from .lookups import Lookups, Paste
+from .looks import Looks
+from .lookups import Lookups
 from .minified import Batch, Minifier
+from .moving_caps import CapScene, CapTable, check_places
 from .outlines import Outlines
+from .paste import Paste
+from .paste_moving import PasteMoving
 from .rendered import Rendered
 from .single_ray import SingleRay
 from .streaks import Streak
@@ -81,10 +86,15 @@ class Renderer:
     look a pixel, and hard edges, which is the fastest.
     border: what lies beyond the image: "mirror", "edge", or a `Surround` of it, beyond which it is mirrored.
     linear_light: whether values are sRGB and light is to be averaged, not values.
-    moving: whether most drops move from frame to frame: plans of caps on one far face are made some fifty times as
-    fast, frames drawn in about twice the time, and pixels in drops off by 4 gray levels or so (`single_ray`).
-    lasting: whether a plan serves thousands of frames: planned some five times as long, frames drawn in half the time,
-    with the same error (`pursuit`). 16-bit and floating point frames may then show values a little beyond the image's.
+    moving: whether most drops move from frame to frame: caps on far faces are then traced as they are drawn, by loops
+    in machine code (`moving_caps`; needs numba, `rainstereo.compiled`), so that a plan costs next to nothing, and
+    pixels in drops are off by 2 gray levels or so, at tolerances from 2.5 on by some more, in less time. Without numba,
+    with lenses that only mrcal knows, and for other shapes, drops are planned with a few looks a pixel (`single_ray`):
+    in some four times as long, and off by 4. Drops under gravity are drawn as caps of their volume where the bound of
+    what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).
+    lasting: whether a plan serves hundreds of frames: planned in about twice the time (five times without numba), of a
+    third of the texels, with the same error (`pursuit`). 16-bit and floating point frames may then show values a little
+    beyond the image's.
     """
 
     camera: Camera
@@ -113,8 +123,15 @@ class Renderer:
         """Trace drops: one, a table of them, or any mixture of both, in no particular order."""
         everyone = tuple(shapes(drops))
         sharp, layers = self.split(everyone)
+        tables = self._of_caps_alone(self._cap_tiers.drawn(sharp)) if self.moving else None
+        if tables is not None:
+            return Plan(self, everyone, tables, tuple(layers))
         groups = self.groups(sharp)
         return Plan(self, everyone, tuple(self.lookups(groups, range(len(groups)))), tuple(layers))
+
+    def tier(self, drop: Drop) -> DropTier:
+        """By which optics a sharp drop is drawn: its own, or, if it moves and the bound allows it, those of its cap."""
+        return self._cap_tiers.of(drop) if self.moving else OWN
 
     def sequence(self, motion: Motion | None = None) -> sequence.Sequence:
         """Plans of frame after frame, in which what does not change is traced once. motion: for `Sequence.at`."""
@@ -149,13 +166,62 @@ class Renderer:
         given = np.fromiter(numbers, dtype=np.intp)
         if not self.moving:
             return self._minifier.lookups(self._batches(groups, given))
+        groups = [Group(tuple(self._cap_tiers.drawn(group.drops)), group.outlines) for group in groups]
+        tables, others = list[Any](), list[int]()
+        for panel, some in _by_far_face(groups).items():
+            if panel is None:
+                others += some
+            else:
+                tables += self._of_caps(panel, [groups[i] for i in some], given[some])
+        if others:
+            tables += self._single_ray.tables(self._batches([groups[i] for i in others], given[others]))
+        return tables
+
+    def _of_caps_alone(self, drops: Sequence[Drop]) -> tuple[CapTable, ...] | None:
+        """The table of caps on one panel's far face, all at once; None if they are not, or compiled loops cannot."""
+        if not drops or not all(isinstance(drop, SphericalCap) for drop in drops):
+            return None
+        caps = [drop for drop in drops if isinstance(drop, SphericalCap)]
+        scene = (
+            self._cap_scene(caps[0].panel)
+            if {(cap.panel, cap.face) for cap in caps} == {(caps[0].panel, "far")}
+            else None
+        )
+        if scene is None or min(cap.index for cap in caps) < 1:
+            return None
+        outlines = Outlines.of(caps, self.camera, self.chamber)
+        shown = np.flatnonzero(outlines.radius > 0)
+        if not shown.size:
+            return ()
+        check_places(caps, self.chamber, self.depth)
+        seen = [caps[i] for i in shown]
+        return (CapTable.of(scene, seen, outlines.take(shown), shown),)
+
+    def _of_caps(self, panel: int, groups: Sequence[Group], numbers: Indices) -> list[Any]:
+        """Tables of caps on a panel's far face."""
         caps = [drop for group in groups for drop in group.drops if isinstance(drop, SphericalCap)]
-        places = {(cap.panel, cap.face) for cap in caps}
-        if len(caps) < sum(len(group.drops) for group in groups) or len(places) > 1 or caps[0].face != "far":
-            return self._single_ray.tables(self._batches(groups, given))
-        pixels, which = Outlines.joined([group.outlines for group in groups]).pixels()
-        of_drop = np.repeat(given, [len(group.drops) for group in groups])
-        return self._single_ray.tables_of_caps(caps, pixels, which, of_drop[which])
+        outlines = Outlines.joined([group.outlines for group in groups])
+        of_cap = np.repeat(numbers, [len(group.drops) for group in groups])
+        scene = self._cap_scene(panel)
+        if scene is not None and min(cap.index for cap in caps) >= 1:
+            check_places(caps, self.chamber, self.depth)
+            return [CapTable.of(scene, caps, outlines, of_cap)]
+        pixels, which = outlines.pixels()
+        return self._single_ray.tables_of_caps(caps, pixels, which, of_cap[which])
+
+    def _cap_scene(self, panel: int) -> CapScene | None:
+        """What compiled loops need to draw caps on a panel's far face; None if they cannot."""
+        if not (available() and CapScene.suits(self.camera)):
+            return None
+        if panel not in self._cap_scenes:
+            where = (self.scene_size, self.shift, self.fold, panel)
+            scene = CapScene(self.camera, self.chamber, self.depth, self.tolerance, *where)
+            self._cap_scenes[panel] = scene if scene.lattice.is_whole else None
+        return self._cap_scenes[panel]
+
+    @cached_property
+    def _cap_scenes(self) -> dict[int, CapScene | None]:
+        return {}
 
     def _batches(self, groups: Sequence[Group], numbers: Indices) -> list[Batch]:
         """Caps of a face in one batch if each is alone, in another if not; groups with other drops on their own."""
@@ -165,6 +231,10 @@ class Renderer:
             caps = len(places) == 1 and all(isinstance(drop, SphericalCap) for drop in group.drops)
             alike.setdefault((*places, len(group.drops) == 1) if caps else i, []).append(i)
         return [_batch([groups[i] for i in some], numbers[some]) for some in alike.values()]
+
+    @cached_property
+    def _cap_tiers(self) -> CapTiers:
+        return CapTiers(self.camera, self.chamber, self.depth, self.tolerance)
 
     @cached_property
     def _minifier(self) -> Minifier:
@@ -241,7 +311,7 @@ class Plan:
 
     renderer: Renderer
     drops: Sequence[Drop]
-    tables: Sequence[Lookups] | Sequence[Looks] = field(repr=False)
+    tables: Sequence[Lookups | Looks | CapTable] = field(repr=False)
     layers: Sequence[BlurredLayer] = field(repr=False)
 
     def apply(self, image: Image) -> Image:
@@ -264,11 +334,11 @@ class Plan:
             layer.paste(scene, out)
 
     @cached_property
-    def _paste_all(self) -> Paste | PasteLooks:
+    def _paste_all(self) -> Paste | PasteMoving:
         if self.renderer.moving:
-            return PasteLooks([table for table in self.tables if isinstance(table, Looks)])
+            return PasteMoving(self.tables)
         tables = [table for table in self.tables if isinstance(table, Lookups)]
-        return Paste(tables, self.renderer.scene_size, self.renderer.camera.width)
+        return Paste(tables, self.renderer.scene_size)
 
     def _in_light(self, image: Image, out: Image) -> None:
         """The same, averaging light; only pixels that drops touch are converted back."""
@@ -285,6 +355,14 @@ class Plan:
             self.apply(image), self.opacity > 0, self.opacity, self.displacement, self.unknown, self.drops,
             renderer.settings,
         )  # fmt: skip
+
+    @cached_property
+    def tiers(self) -> tuple[DropTier, ...]:
+        """By which optics each drop is drawn, in the order of `drops`, and what that may be wrong by."""
+        if not self.renderer.moving:
+            return (OWN,) * len(self.drops)
+        blurred = {id(drop) for layer in self.layers for drop in layer.drops}
+        return tuple(OWN if id(drop) in blurred else self.renderer.tier(drop) for drop in self.drops)
 
     @cached_property
     def opacity(self) -> Array:
@@ -319,6 +397,16 @@ class Plan:
             rows, columns, unknown = layer.unknown
             found[rows, columns] |= unknown
         return found
+
+
+def _by_far_face(groups: Sequence[Group]) -> dict[int | None, list[int]]:
+    """Numbers of groups of nothing but caps on one panel's far face, by the panel; None: the others."""
+    found: dict[int | None, list[int]] = {}
+    for i, group in enumerate(groups):
+        places = {(drop.panel, drop.face) if isinstance(drop, SphericalCap) else None for drop in group.drops}
+        place = places.pop() if len(places) == 1 else None
+        found.setdefault(place[0] if place is not None and place[1] == "far" else None, []).append(i)
+    return found
 
 
 def _batch(groups: Sequence[Group], numbers: Indices) -> Batch:

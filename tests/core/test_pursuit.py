@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from rainstereo import Camera, Chamber, Panel
 from rainstereo.droplet import SphericalCap
 from rainstereo.patch import folded
-from rainstereo.rain import lookups
 from rainstereo.rain.pursuit import MOST, SHRUNK, Pursuit
 from rainstereo.rain.pyramid import copies, copy_starts, half, sizes, starts
 from rainstereo.rain.quadtree import UNIT, Quadtree, steps_between
@@ -28,11 +27,17 @@ def texels(image: np.ndarray) -> np.ndarray:
     levels = [image]
     for _ in sizes(SIZE)[1:]:
         levels.append(half(levels[-1]))
-    padded = [np.pad(level, ((0, 1), (0, 1), (0, 0)), "edge") for level in levels[:-1]]
-    even = [(level.shape[0] // 2 * 2, level.shape[1] // 2 * 2) for level in padded]
-    wide = [(p[:-1, :w:2] + p[:-1, 1:w:2]) / 2 for p, (_, w) in zip(padded, even, strict=True)]
-    tall = [(p[:h:2, :-1] + p[1:h:2, :-1]) / 2 for p, (h, _) in zip(padded, even, strict=True)]
-    return np.concatenate([part.reshape(-1, 3) for part in (*levels, *wide, *tall)])
+    found = []
+    for copy in copies(SIZE):
+        values = levels[min(copy.across, copy.down)]
+        for axis, times in ((1, copy.across - copy.down), (0, copy.down - copy.across)):
+            for _ in range(times):
+                padded = np.pad(values, [(0, values.shape[n] % 2 * (n == axis)) for n in range(3)], "edge")
+                first, second = (padded[:, n::2] if axis else padded[n::2] for n in (0, 1))
+                values = (first + second) / 2
+        assert values.shape == (copy.height, copy.width, 3)
+        found.append(values.reshape(-1, 3))
+    return np.concatenate(found)
 
 
 def pixels(seed: int, count: int, widest: float, side: int = SIDE) -> tuple[np.ndarray, np.ndarray]:
@@ -86,16 +91,17 @@ def test_weights_are_the_best_ones():
     taps = pursuit().taps(x, y, even(x))
     steps = steps_between(x, y, even(x))
     firsts, shapes = np.array(copy_starts(SIZE)), copies(SIZE)
-    inside = np.stack(np.meshgrid(*2 * [(np.arange(8) + 0.5) / 8]), -1).reshape(-1, 2)
-    last = 0
+    last = free = 0
     for pixel, count in enumerate(taps.counts):
         some = slice(last, last + count)
         last += count
         which = np.searchsorted(firsts, taps.texels[some], "right") - 1
-        points = []
+        points, finest = [], min(min(shapes[number].across, shapes[number].down) for number in which)
         for texel, number in zip(taps.texels[some], which, strict=True):
             copy = shapes[number]
             corner = np.array(divmod(texel - firsts[number], copy.width))[::-1]
+            many = [16 if halvings - finest > 2 else 8 for halvings in (copy.across, copy.down)]
+            inside = np.stack(np.meshgrid(*((np.arange(n) + 0.5) / n for n in many)), -1).reshape(-1, 2)
             points.append((corner + inside) * [2**copy.across, 2**copy.down] - 0.5)
         own, across, along = (np.stack(part, -1)[:, pixel] for part in ((x, y), steps[:2], steps[2:]))
         rays = np.concatenate([own + a * across + b * along for a in (-0.25, 0.25) for b in (-0.25, 0.25)])
@@ -111,8 +117,12 @@ def test_weights_are_the_best_ones():
             return float(of_all @ covariance @ of_all)
 
         ours = square(taps.weights[some] / UNIT)
+        if np.minimum(best, 0).sum() < -0.4:  # more than there is room for
+            continue
+        free += 1
         assert ours <= 1.15 * square(best) + 0.02  # places rounded to half a texel, weights to 1/4096
         assert ours < 0.9 * square(np.full(count, 1 / count))
+    assert free >= 9
 
 
 @settings(max_examples=20, deadline=None)
@@ -146,35 +156,9 @@ def test_nothing_to_see():
 
 def test_copies_follow_the_levels():
     assert copy_starts(SIZE)[: len(starts(SIZE))] == starts(SIZE)
-    wide, tall = (next(c for c in copies((101, 61)) if (c.across, c.down) == shape) for shape in ((2, 1), (1, 2)))
-    assert (wide.width, wide.height, tall.width, tall.height) == (26, 31, 51, 16)
+    wide, tall = (next(c for c in copies((101, 61)) if (c.across, c.down) == shape) for shape in ((4, 2), (2, 3)))
+    assert (wide.width, wide.height, tall.width, tall.height) == (7, 16, 26, 8)
     assert texels(photograph(SIZE)).shape == (copy_starts(SIZE)[-1], 3)
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3])
-def test_words_of_bytes(channels):
-    """Packing, means and clipping of three bytes in a word, for every value of a field."""
-    rng = np.random.default_rng(5)
-    one, other = rng.integers(0, 256, (2, 999, channels), dtype=np.uint8)
-    shown = np.empty_like(one)
-    words = lookups._packed(one)
-    lookups._unpack(words.copy(), shown)
-    np.testing.assert_array_equal(shown, one)
-    lookups._unpack(lookups._means_of_words(words, lookups._packed(other)), shown)
-    np.testing.assert_array_equal(shown, (one.astype(int) + other + 1) // 2)
-
-
-def test_words_are_clipped_field_by_field():
-    values = np.random.default_rng(6).permuted(np.tile(np.arange(-lookups.BELOW, 384), (3, 1)), axis=1)
-    fraction = np.random.default_rng(7).integers(0, UNIT, values.shape)
-    words = np.zeros(values.shape[1], dtype=np.uint64)
-    for channel, (value, part) in enumerate(zip(values, fraction, strict=True)):
-        words += ((value + lookups.BELOW) * UNIT + part).astype(np.uint64) << np.uint64(channel * lookups.FIELD)
-    words >>= np.uint64(lookups.SHIFT)
-    lookups._clip(words)
-    shown = np.empty((len(words), 3), dtype=np.uint8)
-    lookups._unpack(words, shown)
-    np.testing.assert_array_equal(shown, np.clip(values, 0, 255).T)
 
 
 CAMERA = Camera.pinhole(800, 800, 199.5, 149.5, *SIZE)

@@ -1,0 +1,213 @@
+"""Rays through spherical caps on a panel's far face, dozens at a time: closed forms that compile to vector code.
+
+The optics are those of `spherical_refraction.leave_far_face`, which the tests hold them to. Where the rays of pixels
+meet the face, and at what angle, changes smoothly over the image: over a tile of it, it is a polynomial through nine
+nodes of a lattice that is made once for a camera and a pane. A cap's centre is subtracted from the nodes in double
+precision; from there on everything is small, and single precision does.
+
+All numbers about a tile stand in one array, in planes of 64: so the compiler sees that nothing overlaps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from .compile import inlined
+
+PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
+OWN, SIDES, ABOVE, BELOW = (np.uint64(64 * i) for i in (11, 14, 17, 20))
+"""Rays of a row of pixels: through their middles, their left and right sides, and above and below; places, and gain."""
+SUB = np.uint64(64 * 23)  # of one pixel
+PATCH = np.uint64(64 * 26)
+HIDDEN, RED, GREEN, BLUE = (np.uint64(64 * i) for i in (43, 44, 45, 46))
+"""Of a row: the share of each pixel that a cap hides, and what it shows there."""
+STEPS = np.uint64(64 * 47)
+"""From a pixel's own rays to their neighbours: pairs of planes."""
+PLANES = 73
+Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
+
+ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
+ALONG = np.float32(1e-9)  # as in the tracer
+CAP_X, CAP_Y, CAP_SQUARE, CAP_DEPTH, CAP_CURVATURE, CAP_INDEX, CAP_DIM = range(7)
+"""Columns of a table of caps, float64: centre in the panel frame, contact radius squared, depth of the sphere's centre
+below the face, 1 / its radius, index, and which of the lattice's planes says how the index dims."""
+
+VIEW_C, VIEW_Z, VIEW_INVERSE, VIEW_FOLD, VIEW_LENS = 9, 11, 12, 13, 14
+"""Parts of a view, float32: rows of the matrix from the panel frame to the camera's, the first two times the focal
+lengths (9); the principal point (2); distance of the last face; 1 / depth of the scene; the square of the radius at
+which the lens model folds back; fx, fy and its coefficients, OpenCV's first 12 (14)."""
+
+STEP = 8  # pixels between nodes
+X_NODE, Y_NODE, KX_NODE, KY_NODE, DIM_NODE = range(5)
+
+
+@inlined
+def fit(nodes: Any, cap: Any, u: Any, v: Any, reach: Any, tile: Any) -> Any:
+    """Polynomials of x, y, kx, ky and dimming over a tile, (5, 3, 3) float32, and the pixel that they are about.
+
+    nodes: (4 + D, h, w) float64. u, v: the tile's middle; reach: pixels from there to its sides.
+    """
+    most = max(min((nodes.shape[2] - 1) // 2, (nodes.shape[1] - 1) // 2), 1)
+    step = min(max(int(0.87 * reach / STEP + 0.5), 1), most)  # about where the error is least
+    i = min(max((u + STEP // 2) // STEP, step), nodes.shape[2] - 1 - step)
+    j = min(max((v + STEP // 2) // STEP, step), nodes.shape[1] - 1 - step)
+    scale = 1.0 / (STEP * step)
+    for plane in range(5):
+        source = plane if plane < 4 else 4 + int(cap[CAP_DIM])
+        base = cap[CAP_X] if plane == X_NODE else cap[CAP_Y] if plane == Y_NODE else 0.0
+        for row in range(3):
+            line = j + (row - 1) * step
+            a = nodes[source, line, i - step] - base
+            b = nodes[source, line, i] - base
+            c = nodes[source, line, i + step] - base
+            tile[plane, row, 0] = np.float32(b)
+            tile[plane, row, 1] = np.float32(0.5 * (c - a) * scale)
+            tile[plane, row, 2] = np.float32(0.5 * (a + c - 2 * b) * scale * scale)
+        for power in range(3):
+            a, b, c = tile[plane, 0, power], tile[plane, 1, power], tile[plane, 2, power]
+            tile[plane, 0, power] = b
+            tile[plane, 1, power] = np.float32(0.5 * (c - a) * scale)
+            tile[plane, 2, power] = np.float32(0.5 * (a + c - b - b) * scale * scale)
+    return np.float32(i * STEP), np.float32(j * STEP)
+
+
+@inlined
+def of_row(tile: Any, t: Any, line: Any) -> None:
+    """The polynomials, (15,), of a row, t pixels from that which a tile's are about."""
+    for plane in range(5):
+        for power in range(3):
+            line[3 * plane + power] = tile[plane, 0, power] + t * (tile[plane, 1, power] + t * tile[plane, 2, power])
+
+
+@inlined
+def take_up(line: Any, s: Any, low: Any, high: Any, rays: Any) -> None:
+    """Rays of lanes low to before high, s + lane pixels along a row."""
+    x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
+    a0, a1, a2, b0, b1, b2 = line[6], line[7], line[8], line[9], line[10], line[11]
+    d0, d1, d2 = line[12], line[13], line[14]
+    for j in range(np.uint64(low), np.uint64(high)):
+        at = s + np.float32(np.int32(j))
+        rays[PX + j] = x0 + at * (x1 + at * x2)
+        rays[PY + j] = y0 + at * (y1 + at * y2)
+        rays[KX + j] = a0 + at * (a1 + at * a2)
+        rays[KY + j] = b0 + at * (b1 + at * b2)
+        rays[DIM + j] = d0 + at * (d1 + at * d2)
+
+
+@inlined
+def room_of_row(line: Any, s: Any, lanes: Any, square: Any, rays: Any) -> None:
+    """Contact radius squared less the square of the distance from the centre, of a row's rays on the face."""
+    x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
+    for j in range(np.uint64(lanes)):
+        at = s + np.float32(np.int32(j))
+        x, y = x0 + at * (x1 + at * x2), y0 + at * (y1 + at * y2)
+        rays[NEXT + j] = square - x * x - y * y
+
+
+@inlined
+def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: Any) -> None:
+    """Rays that have been taken up, through the cap, the rest of the chamber and to the scene; written from `to` on.
+
+    The gain is 0 where no light comes through. later: (F, 3) float32, thickness before a face and the indices
+    on both sides, of the faces behind the cap's.
+    """
+    square, depth, curvature = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH]), np.float32(cap[CAP_CURVATURE])
+    n = np.float32(cap[CAP_INDEX])
+    q = n * n
+    over = (ONE - q) * curvature
+    first, last = np.uint64(low), np.uint64(high)
+    for j in range(first, last):
+        px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
+        kz = np.float32(math.sqrt(q - kx * kx - ky * ky))
+        room = square - px * px - py * py
+        b = kz * depth + px * kx + py * ky
+        root = np.float32(math.sqrt(b * b + room * q))
+        # the root of the quadratic, as the product of both roots over the other
+        s = room / (b + root) if b >= ZERO else (root - b) / q
+        before = root * curvature  # component of the wave vector along the sphere's normal
+        inside = before * before + (ONE - q)
+        turned = np.float32(math.sqrt(inside))
+        bend = over / (turned + before)
+        p, t = before + q * turned, before + turned
+        pt = p * t
+        passed = (before * turned + before * turned) * (p * p + q * t * t) / (pt * pt)
+        rise = s * kz
+        px += s * kx
+        py += s * ky
+        up = kz + bend * (rise + depth)
+        rays[PX + j] = px
+        rays[PY + j] = py
+        rays[RISE + j] = rise
+        rays[KX + j] = kx + bend * px
+        rays[KY + j] = ky + bend * py
+        rays[KZ + j] = up
+        # beside the contact circle the sphere goes on below the face, for pixels at the edge, unless it hangs over
+        inside = inside if b >= ZERO or room > ZERO else ZERO
+        rays[to + GAIN + j] = passed * rays[DIM + j] if inside > ZERO and up > ZERO else ZERO
+    for face in range(len(later)):
+        thick, q1, q2 = later[face, 0], later[face, 1] * later[face, 1], later[face, 2] * later[face, 2]
+        for j in range(first, last):
+            kz = rays[KZ + j]
+            step = (thick - rays[RISE + j]) / kz
+            rays[PX + j] += step * rays[KX + j]
+            rays[PY + j] += step * rays[KY + j]
+            rays[RISE + j] = ZERO
+            inside = kz * kz + (q2 - q1)
+            turned = np.float32(math.sqrt(inside))
+            p, t = q2 * kz + q1 * turned, kz + turned
+            pt = p * t
+            passed = (kz * turned + kz * turned) * (p * p + q1 * q2 * t * t) / (pt * pt)
+            rays[KZ + j] = turned
+            rays[to + GAIN + j] = rays[to + GAIN + j] * passed if inside > ZERO else ZERO
+    _project(np.float32(cap[CAP_X]), np.float32(cap[CAP_Y]), view, rays, first, last, to)
+
+
+@inlined
+def _project(cx: Any, cy: Any, view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
+    """Where the camera sees what the rays meet at the scene's depth."""
+    m0, m1, m2, m3, m4, m5, m6, m7, m8 = view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8]
+    u0, v0, end, inverse = view[VIEW_C], view[VIEW_C + 1], view[VIEW_Z], view[VIEW_INVERSE]
+    for j in range(first, last):
+        kx, ky, kz = rays[KX + j], rays[KY + j], rays[KZ + j]
+        x, y, z = rays[PX + j] + cx, rays[PY + j] + cy, rays[RISE + j] + end
+        dz = m6 * kx + m7 * ky + m8 * kz
+        oz = m6 * x + m7 * y + m8 * z
+        per = ONE / dz
+        du = (m0 * kx + m1 * ky + m2 * kz) * per
+        dv = (m3 * kx + m4 * ky + m5 * kz) * per
+        rays[to + j] = du + ((m0 * x + m1 * y + m2 * z) - oz * du) * inverse + u0
+        rays[to + Y_ + j] = dv + ((m3 * x + m4 * y + m5 * z) - oz * dv) * inverse + v0
+        gain = rays[to + GAIN + j]
+        gain = gain if gain > ZERO else ZERO  # not NaN
+        rays[to + GAIN + j] = gain if dz > ALONG and oz * inverse < ONE else ZERO
+    if len(view) > VIEW_LENS:
+        _distort(view, rays, first, last, to)
+
+
+@inlined
+def _distort(view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
+    """The lens's distortion of places; what lies beyond the radius where it folds back goes to that radius."""
+    u0, v0, fold = view[VIEW_C], view[VIEW_C + 1], view[VIEW_FOLD]
+    fx, fy = view[VIEW_LENS], view[VIEW_LENS + 1]
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (
+        view[VIEW_LENS + 2], view[VIEW_LENS + 3], view[VIEW_LENS + 4], view[VIEW_LENS + 5], view[VIEW_LENS + 6],
+        view[VIEW_LENS + 7], view[VIEW_LENS + 8], view[VIEW_LENS + 9], view[VIEW_LENS + 10], view[VIEW_LENS + 11],
+        view[VIEW_LENS + 12], view[VIEW_LENS + 13],
+    )  # fmt: skip
+    two = np.float32(2)
+    for j in range(first, last):
+        x, y = (rays[to + j] - u0) / fx, (rays[to + Y_ + j] - v0) / fy
+        r2 = x * x + y * y
+        shrink = np.float32(math.sqrt(fold / r2)) if r2 > fold else ONE
+        x *= shrink
+        y *= shrink
+        r2 = x * x + y * y
+        radial = (ONE + r2 * (k1 + r2 * (k2 + r2 * k3))) / (ONE + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        xy = two * x * y
+        a = x * radial + p1 * xy + p2 * (r2 + two * x * x) + r2 * (s1 + r2 * s2)
+        b = y * radial + p2 * xy + p1 * (r2 + two * y * y) + r2 * (s3 + r2 * s4)
+        rays[to + j] = a * fx + u0
+        rays[to + Y_ + j] = b * fy + v0

@@ -1,0 +1,32 @@
+"""A hint to the processor to fetch memory that will be needed soon, while it computes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
+
+
+def _hint(write: int) -> Any:
+    @intrinsic
+    def hint(_context: Any, array: Any, _index: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            values = context.make_array(signature.args[0])(context, builder, given[0])
+            place = builder.bitcast(builder.gep(values.data, [given[1]]), ir.IntType(8).as_pointer())
+            number = ir.IntType(32)
+            kind = ir.FunctionType(ir.VoidType(), [place.type, number, number, number])
+            fetch = builder.module.declare_intrinsic("llvm.prefetch", [place.type], kind)
+            builder.call(fetch, [place, number(write), number(3), number(1)])  # into all caches; data
+            return context.get_dummy_value()
+
+        return types.void(array, types.uint64), code
+
+    return hint
+
+
+to_read = _hint(0)
+"""to_read(array, number): of an element of a flat array."""
+to_write = _hint(1)
+"""The same of one that will be written."""

@@ -1,0 +1,373 @@
+"""Caps on a far face that are traced as they are drawn, in machine code: for drops that move from frame to frame.
+
+A table holds caps, not what their pixels look at: that is found on the way to each frame. Where it is asked for, and
+for images of other types than bytes, it is tabulated, by the same loops, once for a plan.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from rainstereo import fresnel, panel_plane
+from rainstereo.camera import Camera
+from rainstereo.chamber import Chamber
+from rainstereo.drop_stack import DropStack
+from rainstereo.droplet import SphericalCap
+from rainstereo.lens import fold_radius
+from rainstereo.panel_plane import PanelFrame
+from rainstereo.refraction import backproject
+from rainstereo.types import Array, Image, Indices, Mask
+
+from .contacts import touching
+from .outlines import Outlines
+from .overlapping import Boxes
+
+STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
+LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
+FAR = 1e7  # pixels: of an outline without end
+FINE, COARSE = (16, 4), (9, 3)
+"""Looks at what a pixel shows, and rays along the side of one at an edge."""
+COARSE_FROM = 2.5  # gray levels that a renderer allows
+LANES = 64
+FEW = 400  # caps, up to which all pairs are compared
+
+
+@dataclass(frozen=True, eq=False)
+class FaceLattice:
+    """Where rays of the camera meet a panel's far face, every few pixels; and what is behind it.
+
+    nodes: (4, h, w) float64: x, y in metres of the panel frame, and the transverse wave vector; of pixels 0, STEP, ...
+    later, view: see `compiled.cap_rays`. origin: of the face's coordinates. index: the panel's.
+    """
+
+    nodes: Array
+    later: Array
+    view: Array
+    origin: Array
+    index: float
+
+    @classmethod
+    def of(cls, camera: Camera, chamber: Chamber, panel: int, depth: float) -> FaceLattice:
+        """The lattice of a camera and a chamber."""
+        frame = PanelFrame.of(chamber)
+        columns, rows = (STEP * np.arange(max(-(-(n - 1) // STEP), 2) + 1.0) for n in camera.size)
+        rays = backproject(np.stack(np.meshgrid(columns, rows), -1), camera, chamber, 2 * panel + 2)
+        points, waves = (part @ frame.R_panel_cam.T for part in (rays.origins, rays.directions))
+        nodes = np.stack([points[..., 0], points[..., 1], waves[..., 0], waves[..., 1]])
+        later, end = _behind(chamber, panel)
+        view = _view(camera, frame, end, depth)
+        return cls(nodes, later, view, frame.origin(chamber, panel), float(chamber.panels[panel].index))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every node has a ray."""
+        return bool(np.isfinite(self.nodes).all())
+
+    def dimming(self, index: float) -> Array:
+        """What enters drops of an index, over what reaches the scene through the bare panels, at each node."""
+        with np.errstate(invalid="ignore"):
+            square = np.square(self.nodes[2]) + np.square(self.nodes[3])
+            panel, drop, air = (np.sqrt(n * n - square) for n in (self.index, index, 1.0))
+            bare = fresnel.transmittance(panel, air, self.index, 1.0)
+            for _, before, behind in self.later.astype(np.float64):
+                one, two = (np.sqrt(n * n - square) for n in (before, behind))
+                bare *= fresnel.transmittance(one, two, float(before), float(behind))
+            found: Array = fresnel.transmittance(panel, drop, self.index, index) / bare
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class CapScene:
+    """What all tables of caps on one face share: camera, panes, and the images that hold the scene."""
+
+    camera: Camera
+    chamber: Chamber
+    depth: float
+    tolerance: float
+    size: tuple[int, int]
+    shift: tuple[int, int]
+    border: str
+    panel: int
+
+    @classmethod
+    def suits(cls, camera: Camera) -> bool:
+        """Whether the loops know the camera's lens."""
+        return camera.model in LENSES
+
+    @cached_property
+    def lattice(self) -> FaceLattice:
+        """Of the far face."""
+        return FaceLattice.of(self.camera, self.chamber, self.panel, self.depth)
+
+    def nodes(self, indices: tuple[float, ...]) -> Array:
+        """The lattice, and how drops of each index dim."""
+        if indices not in self._nodes:
+            self._nodes.clear()
+            dimming = [self.lattice.dimming(index)[None] for index in indices]
+            self._nodes[indices] = np.concatenate([self.lattice.nodes, *dimming])
+        return self._nodes[indices]
+
+    @cached_property
+    def _nodes(self) -> dict[tuple[float, ...], Array]:
+        return {}
+
+    @cached_property
+    def boxes(self) -> Boxes:
+        """Of the images that hold the scene."""
+        return Boxes.of(self.size)
+
+    @cached_property
+    def looks(self) -> tuple[Array, Indices]:
+        """Grids of looks, by how many are side by side; and how many looks each has, the first being their aim."""
+        aim = (COARSE if self.tolerance >= COARSE_FROM else FINE)[0]
+        most = aim // 2
+        grids: Array = np.zeros((most + 1, 5, LANES), dtype=np.float32)
+        counts = np.full(most + 1, aim, dtype=np.int64)
+        for across in range(1, most + 1):
+            down = min(max(aim // across, 2), most)
+            s, t = (part.ravel() for part in np.meshgrid(_middles(across), _middles(down)))
+            counts[across] = len(s)
+            grids[across, :, : len(s)] = s, t, s * s / 2, t * t / 2, s * t
+        return grids.ravel(), counts
+
+    @cached_property
+    def parts(self) -> tuple[int, Array]:
+        """Parts along a pixel's side; places of them, and whether there is another right of and below each."""
+        side = (COARSE if self.tolerance >= COARSE_FROM else FINE)[1]
+        row, column = np.divmod(np.arange(side * side), side)
+        table: Array = np.zeros((4, LANES), dtype=np.float32)
+        middles = _middles(side)
+        table[:, : side * side] = middles[column], middles[row], column < side - 1, row < side - 1
+        return side, table.ravel()
+
+    def go(self, mode: int, out: Any, scene: Any, words: Any, caps: CapTable, record: Any) -> None:
+        """Run the loops over caps, see `compiled.cap_frames.frame`."""
+        from rainstereo.compiled.cap_frames import frame
+
+        lattice, boxes = self.lattice, self.boxes
+        border = 0 if self.border == "mirror" else 1
+        shift = np.float32(self.shift[0]), np.float32(self.shift[1])
+        frame(
+            mode, out, scene, words, (boxes.start, boxes.width, boxes.inverse), border, shift, self.looks, *self.parts,
+            caps.nodes, caps.columns, caps.outlines, caps.rivals, lattice.later, lattice.view, record,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CapTable:
+    """Caps to be traced for a frame. It has the fields of `lookups.Lookups` but taps, made when they are asked for.
+
+    caps: their columns, (N, 6) float64: centre on the face, contact radius and angle, index, and number of the group.
+    circles: (N, 3) outlines in the image.
+    """
+
+    scene: CapScene
+    caps: Array
+    circles: Array = field(repr=False)
+
+    @classmethod
+    def of(cls, scene: CapScene, caps: Sequence[SphericalCap], outlines: Outlines, groups: Indices) -> CapTable:
+        """A table of caps on the scene's face; groups: (N,) numbers kept with them."""
+        rows = [(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps]
+        table = np.concatenate([np.array(rows, dtype=np.float64).reshape(-1, 5), groups[:, None]], axis=1)
+        return cls(scene, table, np.stack([outlines.x, outlines.y, np.minimum(outlines.radius, FAR)], -1))
+
+    @classmethod
+    def joined(cls, parts: list[CapTable]) -> list[CapTable]:
+        """The same in one table for each face."""
+        found: dict[CapScene, list[CapTable]] = {}
+        for part in parts:
+            found.setdefault(part.scene, []).append(part)
+        return [
+            cls(scene, np.concatenate([part.caps for part in some]), np.concatenate([part.circles for part in some]))
+            for scene, some in found.items()
+        ]
+
+    def of_groups(self, groups: Indices) -> CapTable:
+        """Those of some groups."""
+        keep = np.isin(self.caps[:, 5], groups)
+        return self if keep.all() else replace(self, caps=self.caps[keep], circles=self.circles[keep])
+
+    # -- for the loops -------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def columns(self) -> Array:
+        """(N, 7), see `compiled.cap_rays`."""
+        x, y, radius, angle, index, _ = self.caps.T
+        origin = self.scene.lattice.origin
+        place = np.searchsorted(self._indices, index)
+        return np.ascontiguousarray(
+            np.stack(
+                [
+                    origin[0] + x, origin[1] + y, radius * radius, radius / np.tan(angle), np.sin(angle) / radius,
+                    index, place,
+                ],
+                -1,
+            )
+        )  # fmt: skip
+
+    @cached_property
+    def nodes(self) -> Array:
+        """The lattice, and how drops of each index dim."""
+        return self.scene.nodes(tuple(self._indices.tolist()))
+
+    @cached_property
+    def _indices(self) -> Any:
+        return np.unique(self.caps[:, 4])
+
+    @cached_property
+    def outlines(self) -> Array:
+        """(N, 5), see `compiled.cap_tiles`: circles, and the part of `rivals` that is each cap's."""
+        first, _ = self._rivals
+        count = np.diff(first)
+        return np.concatenate([self.circles, np.stack([first[:-1], count], -1)], axis=1)
+
+    @property
+    def rivals(self) -> Indices:
+        """Numbers of caps whose circles meet each cap's."""
+        return self._rivals[1]
+
+    @cached_property
+    def _rivals(self) -> tuple[Indices, Indices]:
+        x, y, radius = self.circles.T
+        shown = np.flatnonzero(radius > 0)
+        x, y, radius = x[shown], y[shown], radius[shown]
+        if len(shown) <= FEW:
+            apart = np.square(x[:, None] - x) + np.square(y[:, None] - y)
+            meets = apart < np.square(radius[:, None] + radius)
+            np.fill_diagonal(meets, False)
+            one, other = np.nonzero(meets)
+        else:
+            one, other = touching(x, y, radius)
+            one, other = np.concatenate([one, other]), np.concatenate([other, one])
+        one, other = shown[one], shown[other]
+        first = np.concatenate([[0], np.cumsum(np.bincount(one, minlength=len(self.caps)))]).astype(np.int64)
+        return first, other[np.argsort(one, kind="stable")].astype(np.int64)
+
+    # -- drawn ---------------------------------------------------------------------------------------------------------
+
+    def draw(self, image: Image, out: Image, words: Any) -> None:
+        """Draw into a frame of up to three channels of bytes, (H, W, C), which holds the clear image."""
+        self.scene.go(0, out, image, words, self, _record(0, 0))
+
+    def values(self, image: Image, below: Image) -> Array:
+        """What the table's pixels show, (M, C) float32, of any image (h, w, C); below: the frame's part of it."""
+        found = self._tabulated
+        texels = np.concatenate([self.scene.boxes.numbers(image), image.reshape(-1, image.shape[2]).astype(np.float32)])
+        ends = np.concatenate([[0], np.cumsum(found.counts)])
+        taps = csr_array((found.weights, found.texels, ends), shape=(len(found.pixels), len(texels)))
+        own = below.reshape(-1, image.shape[2])[found.pixels].astype(np.float32)
+        shown: Array = taps @ texels + found.clear[:, None] * own
+        return shown
+
+    @property
+    def pixels(self) -> Any:
+        """(M,) numbers of pixels, row by row of the frame."""
+        return self._tabulated.pixels
+
+    @property
+    def groups(self) -> Any:
+        """(M,) of the caps that were planned together."""
+        return self.caps[self._tabulated.caps, 5].astype(np.int32)
+
+    @property
+    def clear(self) -> Array:
+        """(M,) share of each pixel that no cap hides."""
+        return self._tabulated.clear
+
+    @property
+    def displacement(self) -> Array:
+        """(M, 2) from a pixel to the mean of what it looks at; NaN where it is dark."""
+        return self._tabulated.displacement
+
+    @property
+    def unknown(self) -> Mask:
+        """(M,) whether a ray may fall beyond the image."""
+        return self._tabulated.unknown
+
+    @cached_property
+    def _tabulated(self) -> _Tabulated:
+        width, height = self.scene.camera.size
+        out, image = (np.zeros((h, w, 0), dtype=np.uint8) for w, h in ((width, height), self.scene.size))
+        words = np.zeros(self.scene.boxes.count, dtype=np.uint64)
+        record = _record(0, 0)
+        self.scene.go(1, out, image, words, self, record)
+        pixels, taps = record[-1].tolist()
+        record = _record(pixels, taps)
+        self.scene.go(2, out, image, words, self, record)
+        return _Tabulated(*record[:-1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Tabulated:
+    """What the loops wrote down: of M pixels and T taps."""
+
+    pixels: Any
+    caps: Any
+    counts: Any
+    clear: Array
+    displacement: Array
+    unknown: Mask
+    texels: Any
+    weights: Array
+
+
+def check_places(caps: Sequence[SphericalCap], chamber: Chamber, depth: float) -> None:
+    """ValueError unless the chamber has room for caps on a far face, and the scene lies beyond them."""
+    space = panel_plane.room(chamber, caps[0].panel, "far")
+    if max(cap.top for cap in caps) >= space:
+        for cap in caps:
+            cap.check_room(space)
+    frame = PanelFrame.of(chamber)
+    low, high = (np.array([bound(cap.centre[i] for cap in caps) for i in (0, 1)]) for bound in (min, max))
+    bases = [frame.base(chamber, (x, y), caps[0].panel, "far") for x in (low[0], high[0]) for y in (low[1], high[1])]
+    if not depth > frame.to_camera(np.array(bases))[:, 2].max():
+        DropStack(chamber, caps).check_depth(depth)
+
+
+def _record(pixels: int, taps: int) -> tuple[Any, ...]:
+    return (
+        np.zeros(pixels, np.int32), np.zeros(pixels, np.int32), np.zeros(pixels, np.int32),
+        np.zeros(pixels, np.float32), np.zeros((pixels, 2), np.float32), np.zeros(pixels, np.bool_),
+        np.zeros(taps, np.int32), np.zeros(taps, np.float32), np.zeros(2, np.int64),
+    )  # fmt: skip
+
+
+def _middles(count: int) -> Array:
+    return (np.arange(count) + 0.5) / count - 0.5
+
+
+def _behind(chamber: Chamber, panel: int) -> tuple[Any, float]:
+    """Faces behind a panel's far one, (F, 3), and the distance of the last face of all: see `compiled.cap_rays`."""
+    later, here, index = [], float(chamber.faces[panel]) + chamber.panels[panel].thickness, 1.0
+    for i in range(panel + 1, len(chamber.panels)):
+        near, n = float(chamber.faces[i]), float(chamber.panels[i].index)
+        later.append((near - here, index, n))
+        here, index = near, n
+        touching_next = i + 1 < len(chamber.panels) and chamber.gaps[i] == 0
+        if math.isfinite(chamber.panels[i].thickness) and not touching_next:
+            later.append((chamber.panels[i].thickness, n, 1.0))
+            here, index = near + chamber.panels[i].thickness, 1.0
+    faces: Image = np.array(later, dtype=np.float32).reshape(-1, 3)
+    return faces, here
+
+
+def _view(camera: Camera, frame: PanelFrame, end: float, depth: float) -> Array:
+    fx, fy, cx, cy = (float(c) for c in camera.intrinsics[:4])
+    matrix = np.diag([fx, fy, 1.0]) @ frame.R_panel_cam.T
+    view = [*matrix.ravel(), cx, cy, end, 1 / depth, 0.0]
+    if len(camera.distortion):
+        fold = 0.999 * min(float(fold_radius(camera.distortion)), 1e6)
+        view[-1] = fold * fold
+        view += [fx, fy, *camera.distortion.tolist(), *[0.0] * (12 - len(camera.distortion))]
+    return np.array(view, dtype=np.float32)
+
+
+__all__ = ["CapScene", "CapTable", "check_places"]

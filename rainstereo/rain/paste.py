@@ -1,0 +1,244 @@
+"""Drawing tables of taps (`lookups`) over a frame.
+
+Bytes are summed three channels at a time (`words`), so that a tap costs one multiplication: in a compiled loop that
+writes each pixel at once (`rainstereo.compiled.sums`), or, without numba and bit for bit the same, as a sparse product.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from rainstereo import compiled
+from rainstereo.types import Image
+
+from .lookups import Lookups
+from .pyramid import copies, copy_starts
+from .quadtree import UNIT
+from .texels import Texels
+from .words import BELOW, EVERY, PACKED, clip, packed, unpack
+
+SHIFT = UNIT.bit_length() - 1
+KEPT = 1 << 24  # taps up to which places of texels are kept
+SHORT, LONG = 20, 32  # bits of a place where a tap has 32 bits, and where it has 64
+MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
+ROWS = 1 << 14  # that are summed at a time: few enough for the caches
+DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Rows of a table that are summed together. number: of the table. rows, taps: in the table."""
+
+    number: int
+    table: Lookups
+    rows: slice
+    taps: slice
+
+    def cut(self, rows: int) -> Iterator[Piece]:
+        """The same in parts of so many rows."""
+        ends = np.concatenate([[0], np.cumsum(self.table.counts[self.rows], dtype=np.int64)])
+        cuts = [*range(0, len(ends) - 1, rows), len(ends) - 1]
+        for a, b in pairwise(cuts):
+            taps = slice(self.taps.start + int(ends[a]), self.taps.start + int(ends[b]))
+            yield Piece(self.number, self.table, slice(self.rows.start + a, self.rows.start + b), taps)
+
+    def matrix(self, kind: type, places: Any, columns: int) -> Any:
+        """As a sparse matrix. places: of the texels of its taps, among so many (columns)."""
+        ends = np.concatenate([[0], np.cumsum(self.table.counts[self.rows])]).astype(np.int32)
+        weights = self.table.weights[self.taps].astype(kind)
+        return csr_array((weights, places.astype(np.int32), ends), shape=(len(ends) - 1, columns))
+
+
+class Paste:
+    """Tables of one frame, and what is done to all pixels of them at once.
+
+    size: (width, height) of the images.
+    """
+
+    def __init__(self, tables: Sequence[Lookups], size: tuple[int, int]) -> None:
+        self.tables = [table for table in tables if len(table.pixels)]
+        self.size = size
+        self.soft = np.concatenate([np.zeros(0, np.intp), *(np.flatnonzero(table.clear) for table in self.tables)])
+        self.taps = sum(len(table.texels) for table in self.tables)
+        self._matrices: dict[type, list[Any]] = {}
+        self._spare: deque[Any] = deque()  # memory for words, of which threads take one each
+
+    def paste(self, scene: Image, below: Image, out: Image) -> None:
+        """Write the pixels of a frame. scene: the clear image. below: the frame's part of it. out: (H, W[, C])."""
+        if not self.tables:
+            return
+        target, beneath = _flat(out), _flat(below)
+        levels = self._needed.levels(scene)
+        if out.dtype == np.uint8:
+            for first in range(0, target.shape[1], PACKED):
+                self._bytes(levels, beneath, target, slice(first, min(first + PACKED, target.shape[1])))
+        else:
+            self._numbers(levels, beneath, target)
+
+    def _bytes(self, levels: list[Image], below: Image, out: Image, part: slice) -> None:
+        """Sums of up to three channels of bytes."""
+        try:
+            row = self._spare.pop()
+        except IndexError:
+            row = np.empty(self._needed.ends[-1], dtype=np.uint64)
+        self._needed.put_words(levels, part, row)
+        if compiled.available():
+            self._compiled(row, below, out, part)
+        else:
+            self._products(row, below, out, part)
+        self._spare.append(row)
+
+    def _compiled(self, words: Any, below: Image, out: Image, part: slice) -> None:
+        from rainstereo.compiled.sums import sum_words
+
+        channels = part.stop - part.start
+        for piece, most, taps in self._fours:
+            rows = piece.rows
+            sum_words(
+                out, below, part.start, channels, words, SHIFT, self._bits, piece.table.pixels[rows].view(np.uint32),
+                most, taps, self._roundings[piece.number][rows], self._clear[piece.number][rows],
+            )  # fmt: skip
+
+    def _products(self, words: Any, below: Image, out: Image, part: slice) -> None:
+        for piece, matrix in self._each(np.uint64):
+            total = matrix @ words
+            total += self._roundings[piece.number][piece.rows] * np.uint64(EVERY)
+            pixels, clear = piece.table.pixels[piece.rows], self._clear[piece.number][piece.rows]
+            soft = np.flatnonzero(clear)
+            total[soft] += packed(below[pixels[soft]][:, part]) * clear[soft].astype(np.uint64)
+            total >>= np.uint64(SHIFT)
+            clip(total)
+            shown: Image = np.empty((len(pixels), part.stop - part.start), dtype=np.uint8)
+            unpack(total, shown)
+            if shown.shape == (len(pixels), out.shape[1]):
+                np.put(_as_one(out), pixels, _as_one(shown))
+            else:
+                out[pixels, part] = shown
+
+    def _numbers(self, levels: list[Image], below: Image, out: Image) -> None:
+        """Sums of anything else, in single precision."""
+        values: Image = np.empty((self._needed.ends[-1], out.shape[1]), dtype=np.float32)
+        self._needed.put_numbers(levels, values)
+        for piece, of_units in self._totals(values):
+            total = np.multiply(of_units, np.float32(1 / UNIT), out=of_units)
+            pixels, clear = piece.table.pixels[piece.rows], piece.table.clear[piece.rows]
+            soft = np.flatnonzero(clear)
+            total[soft] += below[pixels[soft]] * clear[soft, None]
+            if out.dtype.kind == "u":
+                np.clip(np.rint(total, out=total), 0, np.iinfo(out.dtype).max, out=total)
+            np.put(_as_one(out), pixels, _as_one(total.astype(out.dtype)))
+
+    def _totals(self, values: Image) -> Iterator[tuple[Piece, Image]]:
+        if not compiled.available():
+            yield from ((piece, matrix @ values) for piece, matrix in self._each(np.float32))
+            return
+        from rainstereo.compiled.sums import sum_numbers
+
+        for piece, places in self._placed:
+            total: Image = np.empty((piece.rows.stop - piece.rows.start, values.shape[1]), dtype=np.float32)
+            counts = piece.table.counts[piece.rows].view(np.uint32)
+            sum_numbers(total, values, counts, places, piece.table.weights[piece.taps])
+            yield piece, total
+
+    def _each(self, kind: type) -> Iterator[tuple[Piece, Any]]:
+        """Each piece and its matrix."""
+        kept = self._matrices.get(kind)
+        if kept is None:
+            found = ((piece, piece.matrix(kind, places, self._needed.ends[-1])) for piece, places in self._placed)
+            if self.taps > MATRICES:
+                yield from found
+                return
+            kept = self._matrices[kind] = list(found)
+        yield from kept
+
+    # -- found once ----------------------------------------------------------------------------------------------------
+
+    @property
+    def _placed(self) -> Iterator[tuple[Piece, Any]]:
+        """Parts of the tables, and the places of their texels, (T,) uint32."""
+        for piece in self._wholes:
+            for some in piece.cut(ROWS):
+                yield some, self._places[some.table.texels[some.taps]]
+
+    @property
+    def _fours(self) -> Iterable[tuple[Piece, Any, Any]]:
+        """Pieces, and their taps, four rows' together: whole tables, or, to spare memory, parts of them."""
+        if self.taps <= KEPT:
+            return self._kept
+        return (self._in_fours(some) for piece in self._wholes for some in piece.cut(ROWS))
+
+    @cached_property
+    def _kept(self) -> list[tuple[Piece, Any, Any]]:
+        return [self._in_fours(piece) for piece in self._wholes]
+
+    def _in_fours(self, piece: Piece) -> tuple[Piece, Any, Any]:
+        from rainstereo.compiled.sums import AHEAD, FOUR, interleave
+
+        table, counts = piece.table, piece.table.counts[piece.rows]
+        most = np.maximum.reduceat(counts, np.arange(0, len(counts), FOUR))
+        long = FOUR * int(most.sum(dtype=np.int64)) + AHEAD
+        taps = np.empty(long, dtype=np.int32 if self._bits <= SHORT else np.int64)
+        interleave(counts, self._places, table.texels[piece.taps], table.weights[piece.taps], self._bits, most, taps)
+        return piece, most, taps
+
+    @cached_property
+    def _bits(self) -> int:
+        """Of a place among the texels."""
+        return SHORT if self._needed.ends[-1] <= 1 << SHORT else LONG
+
+    @cached_property
+    def _places(self) -> Any:
+        return self._needed.places()
+
+    @cached_property
+    def _wholes(self) -> list[Piece]:
+        return [
+            Piece(number, table, slice(0, len(table.pixels)), slice(0, len(table.texels)))
+            for number, table in enumerate(self.tables)
+        ]
+
+    @cached_property
+    def _needed(self) -> Texels:
+        used = np.zeros(copy_starts(self.size)[-1], dtype=np.bool_)
+        for table in self.tables:
+            used[table.texels] = True
+        return Texels.of(self.size, used)
+
+    @cached_property
+    def _clear(self) -> list[Any]:
+        return [np.rint(table.clear * UNIT).astype(np.uint16) for table in self.tables]
+
+    @cached_property
+    def _roundings(self) -> list[Any]:
+        """What is added to sums before they are cut off: a half, less what was rounded up before, and `BELOW`."""
+        of_copy = np.repeat(
+            np.rint(np.array([c.bias for c in copies(self.size)]) * UNIT), np.diff(copy_starts(self.size))
+        ).astype(np.int16)
+        found: list[list[Any]] = [[np.zeros(0, dtype=np.uint32)] for _ in self.tables]
+        for piece in (
+            some for whole in self._wholes for some in whole.cut(ROWS // 8)
+        ):  # whole tables take hundreds of MB
+            table, counts = piece.table, piece.table.counts[piece.rows]
+            of_taps = table.weights[piece.taps] * of_copy[table.texels[piece.taps]].astype(np.int64)
+            so_far, ends = np.concatenate([[0], np.cumsum(of_taps)]), np.cumsum(counts)
+            shift = np.clip((so_far[ends] - so_far[ends - counts]) / UNIT**2, -DARKEST, DARKEST)
+            found[piece.number].append(np.floor((BELOW + 0.5 - shift) * UNIT).astype(np.uint32))
+        return [np.concatenate(parts) for parts in found]
+
+
+def _as_one(values: Image) -> Any:
+    """A view of rows, (N, C) contiguous, as (N,): all channels are moved at once."""
+    return values.view(np.dtype((np.void, values.itemsize * values.shape[1])))[:, 0]
+
+
+def _flat(image: Image) -> Image:
+    """(pixels, channels), without a copy."""
+    return image.reshape(-1, 1 if image.ndim == 2 else image.shape[-1])

@@ -1,0 +1,284 @@
+"""Caps traced as they are drawn, in machine code: against the tracer, the path without numba, and many exact rays."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rainstereo import Camera, Chamber, Panel
+from rainstereo.compiled import available
+from rainstereo.droplet import SphericalCap
+from rainstereo.rain import render
+from rainstereo.rain.drops import Drops
+from rainstereo.rain.moving_caps import CapScene, CapTable
+from rainstereo.rain.outlines import Outlines
+from rainstereo.rain.overlapping import SCALE, Boxes
+from rainstereo.rain.render import Renderer, Surround
+from rainstereo.trace import GRAZING, Fate, clear_transmittance, trace
+
+from .test_render import CAMERA, DEPTH, PANE, SCENES, TWO, brute_force, cap, photograph, rms
+
+pytestmark = pytest.mark.skipif(not available(), reason="needs numba: pip install rainstereo[fast]")
+
+BENT = Camera(
+    "LENSMODEL_OPENCV8", np.array([780, 790, 201, 148, -0.2, 0.05, 1e-3, -5e-4, 0.01, 0.02, 0.01, 0.003]), 400, 300
+)
+VIEWS = {
+    "square": (CAMERA, PANE, math.inf),
+    "tilted, near": (CAMERA, Chamber((0.1, -0.2, 0.97), 0.057, (Panel(0.003, 1.49),)), 0.4),
+    "two panels": (CAMERA, TWO, DEPTH),
+    "distorted": (BENT, PANE, DEPTH),
+}
+
+
+def scene_of(camera: Camera, chamber: Chamber, depth: float) -> CapScene:
+    return CapScene(camera, chamber, depth, 1.0, camera.size, (0, 0), "mirror", 0)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize(
+    ("place", "radius", "angle"), [((-4, 3), 1.0, 40), ((7, -5), 1.4, 80), ((2, 1), 0.5, 8), ((-9, 6), 0.8, 120)]
+)
+def test_rays_of_a_tile_are_those_of_the_tracer(view, place, radius, angle):
+    """In ten-thousandths of a pixel of the frame, where the lens does not bend the lattice much."""
+    from rainstereo.compiled.cap_rays import GAIN, OWN, PLANES, Y_, fit
+    from rainstereo.compiled.cap_tiles import trace_lanes
+
+    camera, chamber, depth = VIEWS[view]
+    limit = 5e-3 if view == "distorted" else 3e-4
+    drop, scene = cap(*place, radius, angle), scene_of(camera, chamber, depth)
+    outlines = Outlines.of([drop], camera, chamber)
+    table = CapTable.of(scene, [drop], outlines, np.zeros(1, np.intp))
+    u, v = int(outlines.x[0]), int(outlines.y[0])
+    tile, line = np.zeros((5, 3, 3), np.float32), np.zeros(15, np.float32)
+    rays = np.zeros(PLANES * 64, np.float32)
+    u0, v0 = fit(table.nodes, table.columns[0], u, v, 20, tile)
+    planes = rays.reshape(-1, 64)
+    first = int(OWN) // 64
+    errors: list[float] = []
+    for row in (-9.5, -3.0, 0.0, 4.5, 11.0):
+        t, s = np.float32(v + row - v0), np.float32(u - 20.5 - u0)
+        trace_lanes(tile, t, s, 0, 40, table.columns[0], scene.lattice.later, scene.lattice.view, line, rays, OWN)
+        pixels = np.stack([u - 20.5 + np.arange(40), np.full(40, v + row)], -1)
+        seen = trace(pixels, drop, camera, chamber, depth)
+        expected = seen.transmittance / clear_transmittance(pixels, camera, chamber)
+        x, y, gain = planes[first, :40], planes[first + int(Y_) // 64, :40], planes[first + int(GAIN) // 64, :40]
+        good = (seen.status == Fate.THROUGH) & (seen.transmittance > GRAZING)
+        assert (gain[good] > 0).all()
+        error = np.hypot(x - seen.source[:, 0], y - seen.source[:, 1])
+        beside = trace(pixels + [0.5, 0], drop, camera, chamber, depth).source
+        step = 2 * np.hypot(*(beside - seen.source).T)  # what one pixel shows: near the rim, hundreds of pixels
+        known = good & np.isfinite(step)
+        assert (error[known] < 20 * limit * step[known] + 5e-3).all()
+        errors += [*(error[known] / (limit * step[known] + 5e-3))]
+        np.testing.assert_allclose(gain[known], expected[known], rtol=50 * limit)
+        dark = np.isin(seen.fate, [Fate.TOTAL_REFLECTION, Fate.SIDEWAYS])
+        assert not (gain[dark] > 0).any()
+    assert len(errors) > 10
+    assert np.median(errors) < 1
+
+
+@pytest.mark.parametrize("name", ["lone", "overlapping", "two faces", "border"])
+def test_no_worse_than_without_numba(name, monkeypatch):
+    chamber, drops = SCENES[name]
+    image = photograph()
+    expected, covered = brute_force(image, drops, CAMERA, chamber, DEPTH, 12)
+    inside = covered > 0
+    fast = Renderer(CAMERA, chamber, DEPTH, moving=True).plan(drops)
+    assert any(isinstance(table, CapTable) for table in fast.tables) or name == "two faces"
+    monkeypatch.setattr(render, "available", lambda: False)
+    slow = Renderer(CAMERA, chamber, DEPTH, moving=True).plan(drops)
+    assert not any(isinstance(table, CapTable) for table in slow.tables)
+    errors = [rms((plan.apply(image) - expected)[inside]) for plan in (fast, slow)]
+    hidden = [rms((plan.opacity - covered)[inside]) for plan in (fast, slow)]
+    assert errors[0] <= max(1.0, 1.05 * errors[1])
+    assert hidden[0] <= max(0.01, 1.05 * hidden[1])
+    rough = Renderer(CAMERA, chamber, DEPTH, moving=True, tolerance=10).plan(drops)
+    assert rms((rough.apply(image) - expected)[inside]) <= 10
+
+
+@pytest.mark.parametrize(
+    "drop",
+    [
+        cap(14.2, 10.6, 1.2, 60),
+        cap(15.1, 0, 0.4, 60),
+        pytest.param(cap(3, -2, 40, 30), marks=pytest.mark.slow),
+        cap(1, 1, 0.02, 70),
+        cap(1, 1, 0.1, 70),
+        cap(-10, 7, 0.7, 150),
+        cap(0, 0, 0.3, 175),
+        cap(5, 5, 1.0, 1.0),
+    ],
+)
+def test_limits(drop):
+    """At a corner, mostly beyond the image, larger than it, much smaller than a pixel, overhanging, nearly flat."""
+    image = photograph()
+    expected, covered = brute_force(image, [drop], CAMERA, PANE, DEPTH, 8)
+    found = Renderer(CAMERA, PANE, DEPTH, moving=True).plan(drop).render(image)
+    careful = Renderer(CAMERA, PANE, DEPTH).plan(drop).render(image)
+    touched = (covered > 0) | found.drop_mask
+    np.testing.assert_array_equal(found.image[~found.drop_mask], image[~found.drop_mask])
+    # 64 rays are few for a drop of a pixel
+    assert rms((found.opacity - covered)[touched]) < max(0.03, 1.1 * rms((careful.opacity - covered)[touched]))
+    assert rms((found.image - expected)[touched]) < max(3.0, 1.1 * rms((careful.image - expected)[touched]))
+
+
+def test_neighbours_that_hang_over_hide_what_the_tracer_says():
+    drops = [
+        cap(3, 0, 1.0, 70),
+        cap(5.3, 0.4, 1.2, 125),
+        cap(8.5, 0.2, 1.4, 75),
+        cap(-6, 3, 1.0, 110),
+        cap(-4.6, 3, 0.8, 40),
+    ]
+    image = photograph()
+    expected, covered = brute_force(image, drops, CAMERA, PANE, DEPTH, 8)
+    found = Renderer(CAMERA, PANE, DEPTH, moving=True).plan(drops).render(image)
+    inside = covered > 0
+    assert rms((found.opacity - covered)[inside]) < 0.03
+    error = np.abs(found.image - expected).max(-1)[inside]
+    assert (error > 25).mean() < 0.02  # where two caps part, a pixel is one's
+    assert rms(np.sort(error)[: int(0.98 * len(error))]) < 3.0
+
+
+def test_what_is_said_of_pixels_is_what_is_drawn():
+    drops = [cap(2, 1, 1.5, 20), cap(11, 7, 2, 70), cap(11.8, 8, 1, 60)]
+    plan = Renderer(CAMERA, PANE, DEPTH, moving=True).plan(drops)
+    image = photograph()
+    found = plan.apply(image)
+    np.testing.assert_array_equal(found[plan.opacity == 0], image[plan.opacity == 0])
+    numbers = plan.apply(image.astype(np.float32))
+    assert np.abs(np.minimum(numbers, 255) - found).max() <= 2.0
+    assert rms(np.minimum(numbers, 255) - found) < 0.5
+    seen = trace(np.stack(np.meshgrid(np.arange(400.0), np.arange(300.0)), -1), drops, CAMERA, PANE, DEPTH)
+    inside = cv2.erode((seen.status == Fate.THROUGH).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    moved = seen.source - np.stack(np.meshgrid(np.arange(400.0), np.arange(300.0)), -1)
+    assert np.median(np.abs(plan.displacement - moved)[inside]) < 0.05
+    outside = inside & ((seen.source < -2) | (seen.source > [401, 301])).any(-1)
+    within = inside & ((seen.source > 40) & (seen.source < [359, 259])).all(-1)
+    assert outside.any()
+    assert plan.unknown[outside].all()
+    assert not plan.unknown[within].any()
+
+
+def test_nothing_and_the_invisible():
+    image = photograph()
+    renderer = Renderer(CAMERA, PANE, DEPTH, moving=True)
+    for drops in ([], [cap(60, 0)]):
+        found = renderer.plan(drops).render(image)
+        np.testing.assert_array_equal(found.image, image)
+        assert not found.drop_mask.any()
+    with pytest.raises(ValueError, match="tall"):
+        Renderer(CAMERA, TWO, DEPTH, moving=True).plan(SphericalCap((0.0, 0.0), 0.02, 1.5))
+    with pytest.raises(ValueError, match="before a drop"):
+        Renderer(CAMERA, PANE, 0.05, moving=True).plan(cap(0, 0))
+
+
+def test_a_surround_and_other_kinds_of_drops_beside():
+    from rainstereo.height_map import HeightMap
+
+    wide = photograph(700, 500)
+    around = Surround(left=100, top=80, right=200, bottom=120)
+    drops = [cap(5, 3, 1.2, 25), cap(-9, -5, 1.5, 30), HeightMap.of(cap(-2, 6, 1.0, 35), nodes=33)]
+    quick, careful = (
+        Renderer(CAMERA, PANE, DEPTH, border=around, moving=moving).plan(drops).render(wide) for moving in (True, False)
+    )
+    inside = careful.opacity > 0
+    assert rms((quick.image.astype(float) - careful.image)[inside]) < 3
+    assert rms(quick.opacity - careful.opacity) < 0.01
+    assert (quick.unknown != careful.unknown)[inside].mean() < 0.05
+
+
+def test_a_sequence_draws_what_a_plan_draws():
+    renderer, image = Renderer(CAMERA, PANE, DEPTH, moving=True), photograph()
+    sequence = renderer.sequence()
+    drops = [cap(-6, -4, 1.0, 20), cap(5, 3, 1.2, 40), cap(5.9, 3.2, 0.8, 55), cap(8, -6, 1.5, 30)]
+    for step in range(6):
+        drops[step % 4] = cap(-6 + 2 * step, -4 + step, 1.0, 25)
+        np.testing.assert_array_equal(sequence.plan(drops).apply(image), renderer.plan(drops).apply(image))
+
+
+@pytest.mark.parametrize("size", [(64, 48), (37, 23), (3, 5), (1, 1)])
+def test_boxes_are_means(size):
+    boxes = Boxes.of(size)
+    image = np.random.default_rng(1).integers(0, 256, (*size[::-1], 3), dtype=np.uint8)
+    words, numbers = boxes.words(image), boxes.numbers(image)
+    fields = np.stack([words >> np.uint64(21 * i) & np.uint64((1 << 21) - 1) for i in range(3)], -1) / SCALE
+    assert np.abs(fields - numbers).max() <= 0.5
+    if size == (64, 48):
+        for k, step, side in ((0, 2, 4), (1, 2, 8), (2, 4, 16), (3, 8, 32)):
+            i, j = 32 // step, 24 // step
+            part = image[24 - side // 2 : 24 + side // 2, 32 - side // 2 : 32 + side // 2]
+            np.testing.assert_allclose(boxes.part(numbers, k)[j, i], part.mean((0, 1)), atol=1e-3)
+
+
+caps = st.lists(
+    st.builds(cap, st.floats(-16, 16), st.floats(-12, 12), st.floats(0.01, 3), st.floats(2, 170)), max_size=6
+)  # fmt: skip
+
+
+@settings(max_examples=25, deadline=None)
+@given(caps, st.randoms(use_true_random=False))
+def test_any_drops(drops, random):
+    """A gray scene stays within its gray; opacity is a share; the order of the drops does not matter."""
+    renderer = Renderer(CAMERA, PANE, DEPTH, moving=True)
+    flat: np.ndarray = np.full((300, 400), 100, dtype=np.uint8)
+    found = renderer.plan(drops).render(flat)
+    assert found.image.max() <= 108
+    assert (found.image[~found.drop_mask] == 100).all()
+    assert ((found.opacity >= 0) & (found.opacity <= 1)).all()
+    nothing = np.isnan(found.displacement).any(-1)
+    assert (found.image[nothing & (found.opacity == 1)] == 0).all()
+    shuffled = list(drops)
+    random.shuffle(shuffled)
+    np.testing.assert_array_equal(renderer.plan(shuffled).apply(flat), found.image)
+
+
+def test_a_table_of_drops_many_of_which_overlap():
+    rng = np.random.default_rng(3)
+    n = 300
+    drops = Drops(rng.uniform(-0.014, 0.014, n), rng.uniform(-0.01, 0.01, n), rng.uniform(1e-4, 9e-4, n),
+                  rng.uniform(0.3, 1.4, n))  # fmt: skip
+    image = photograph()
+    plan = Renderer(CAMERA, PANE, DEPTH, moving=True).plan(drops)
+    seen = trace(np.stack(np.meshgrid(np.arange(400.0), np.arange(300.0)), -1), plan.drops, CAMERA, PANE, DEPTH)
+    hidden = seen.status != Fate.NO_DROP
+    deep = cv2.erode(hidden.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert (plan.opacity[deep] > 0.5).mean() > 0.999
+    assert (plan.opacity[cv2.dilate(hidden.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0] == 0).all()
+    numbers = np.bincount(np.concatenate([table.pixels for table in plan.tables]), minlength=120_000)
+    assert numbers.max() == 1
+    assert plan.apply(image).shape == image.shape
+
+
+def test_small_drops_under_gravity_are_drawn_as_caps_where_the_bound_allows_it():
+    from rainstereo.rain.cap_tier import cap_bound
+    from rainstereo.tiers import Method
+    from rainstereo.young_laplace_drop import YoungLaplaceDrop
+
+    image = photograph()
+    drops = [
+        YoungLaplaceDrop((0.004 * i - 0.008, 0.002 * i - 0.004), radius, math.radians(60))
+        for i, radius in enumerate((1e-4, 2.5e-4, 4e-4, 8e-4))
+    ]
+    exact = Renderer(CAMERA, PANE, DEPTH).plan(drops)
+    chosen, errors = {}, list[float]()
+    for tolerance in (0.5, 4.0, 40.0):
+        plan = Renderer(CAMERA, PANE, DEPTH, tolerance=tolerance, moving=True).plan(drops)
+        chosen[tolerance] = [tier.tier.method is Method.CAP for tier in plan.tiers]
+        assert all(tier.bound <= tolerance for tier in plan.tiers)
+        assert plan.drops == tuple(drops)
+        inside = exact.opacity > 0
+        errors.append(rms((plan.apply(image).astype(float) - exact.apply(image))[inside]))
+        assert errors[-1] <= errors[0] + tolerance
+    assert errors[0] <= 8.0
+    assert chosen[0.5] == [False] * 4
+    assert sum(chosen[0.5]) < sum(chosen[4.0]) < sum(chosen[40.0])
+    bounds = [cap_bound(drop, CAMERA, PANE, DEPTH) for drop in drops]
+    assert bounds == sorted(bounds)
+    weightless = YoungLaplaceDrop((0.0, 0.0), 8e-4, math.radians(60), bond=0.0)
+    assert cap_bound(weightless, CAMERA, PANE, DEPTH) < 0.05
+    assert Renderer(CAMERA, PANE, DEPTH).plan(drops).tiers[0].bound == 0
