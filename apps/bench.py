@@ -62,6 +62,8 @@ class Options:
     """Images for stage cavity: OpenPTV's set, cam1.png to cam4.png with its .ori files. `all` skips it without."""
     images: Path | None = None
     """Photographs, of which none taught the weights, for the stage derain; one of scikit-image's without it."""
+    only: tuple[str, ...] = ()
+    """Only these works of the stage, by the names that their pictures have (rain-still.svg: still)."""
     docs: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write STAGE.md and its pictures into this folder, as in docs/benchmarks."""
 
@@ -78,6 +80,8 @@ def run(options: Options) -> int:
             raise ValueError(f"there is no stage {name!r}; expected one of {', '.join(STAGES)}, or all")
     if options.images is not None and "derain" not in names:
         raise ValueError(f"--images is for the stage derain; {options.stage} measures without any")
+    if options.only and options.stage == "all":
+        raise ValueError(f"--only {' '.join(options.only)} names works of one stage; all stages were asked for")
     if options.repeats < 1:
         raise ValueError(f"--repeats is {options.repeats}; expected 1 or more")
     if any(os.environ.get(name) != value for name, value in SINGLE_THREAD.items()):
@@ -106,6 +110,7 @@ def _arguments(options: Options, stage: str) -> list[str]:
     words += ["--quick"] if options.quick else []
     words += ["--cavity", str(options.cavity)] if options.cavity is not None else []
     words += ["--images", str(options.images)] if options.images else []
+    words += ["--only", *options.only] if options.only else []
     words += ["--out", str(options.out)]
     return words if options.docs is None else [*words, "--docs", str(options.docs)]
 
@@ -116,12 +121,21 @@ def _run_on_one_thread(options: Options) -> int:
     return subprocess.run(arguments, env={**os.environ, **SINGLE_THREAD}, check=False).returncode
 
 
+def _some(stage: Stage, names: tuple[str, ...]) -> Stage:
+    """The stage with these works only; all if none is named."""
+    known = [work.name for work in stage.works]
+    if set(names) - set(known):
+        raise ValueError(f"--only is {' '.join(names)}; the works of {stage.name} are {', '.join(known)}")
+    some = tuple(work for work in stage.works if not names or work.name in names)
+    return dataclasses.replace(stage, works=some)
+
+
 def _run_stage(name: str, options: Options) -> dict[str, object]:
     record = Record("bench", options)
     before = machine()
     build = importlib.import_module(STAGES[name]).build
     given = {"cavity": options.cavity, "derain": options.images}.get(name)
-    stage: Stage = build(options.seed, options.quick, *([] if given is None else [given]))
+    stage: Stage = _some(build(options.seed, options.quick, *([] if given is None else [given])), options.only)
     outcomes = _measure_all(stage, min(options.repeats, 3) if options.quick else options.repeats)
     for key, value in bench_page.figures(stage, outcomes, before).items():
         record[key] = value

@@ -136,7 +136,7 @@ def _trace_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised
             ),
             Variant(
                 frame,
-                lambda: cv2.remap(image, maps, np.zeros(0), cv2.INTER_LINEAR),
+                lambda: cv2.remap(image, maps, None, cv2.INTER_LINEAR),  # type: ignore[call-overload]
                 lambda _: float("nan"),
                 note="the yardstick: float maps, linear, 3 channels",
             ),

@@ -106,7 +106,7 @@ def _pair_work(name: str, title: str, rig: Rig, alignment: Alignment, pair: Pair
         ),
         Variant(
             "2 x cv2.remap, float",
-            lambda: [cv2.remap(i, m, np.zeros(0), cv2.INTER_LINEAR) for i, m in zip(pair, maps, strict=True)],
+            lambda: [cv2.remap(i, m, None, cv2.INTER_LINEAR) for i, m in zip(pair, maps, strict=True)],  # type: ignore[call-overload]
             error,
             note="bare call, maps at hand",
         ),

@@ -43,9 +43,12 @@ class Options:
     skip: bool = True
     """Whether cells without drops are left as they are, and not computed."""
     threshold: float | None = None
-    """Harm by drops, 0 to 1, from which on a cell is restored, too, where its surroundings are computed anyway."""
+    """Worth of restoring a cell of 16 pixels, 0 to 1, from which on it is, where it is computed."""
     certain: float | None = None
-    """Harm from which on a cell is worth computing; lower finds fainter drops, and more that are none."""
+    """Worth of four cells together, 0 to 4, from which on they are computed; lower finds fainter drops, and more that
+    are none."""
+    evident: float | None = None
+    """What some four cells of an image must be worth for any of it to be computed."""
     halo: int | None = None
     """Pixels that the network sees around what it restores."""
     tile: int | None = None
@@ -109,7 +112,8 @@ def restorer(options: Options) -> Restorer:
     from rainstereo.model.restore import Restorer
 
     given: dict[str, float | int | None] = {
-        "threshold": options.threshold, "certain": options.certain, "halo": options.halo,
+        "threshold": options.threshold, "certain": options.certain, "evident": options.evident,
+        "halo": options.halo,
         "max_pixels": None if options.max_megapixels is None else int(options.max_megapixels * (1 << 20)),
     }  # fmt: skip
     more = {name: value for name, value in given.items() if value is not None}
@@ -133,7 +137,7 @@ def key_of(options: Options, made: Restorer) -> str:
     weights = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
     settings = (
         leaves_out() if options.skip else "",
-        options.threshold, options.certain, options.halo, options.tile, options.max_megapixels,
+        options.threshold, options.certain, options.evident, options.halo, options.tile, options.max_megapixels,
         options.format, options.video_format, options.lossless, options.detect_every, options.hold, options.reuse,
     )  # fmt: skip
     made_with = [value for name, value in versions().items() if name in ("rainstereo", "torch", "opencv")]

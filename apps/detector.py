@@ -30,7 +30,7 @@ MOST_BYTES = 200_000
 class Options:
     """Train the drop detector of `rainstereo derain` on clear images, on which drops are rendered.
 
-    Writes NAME.safetensors and its card NAME.toml. About 20 minutes on a processor's core for the defaults. The same
+    Writes NAME.safetensors and its card NAME.toml. About 25 minutes on a processor's core for the defaults. The same
     seed gives the same weights on one machine.
     """
 
@@ -38,6 +38,9 @@ class Options:
     """Clear images: files, folders or quoted globs; larger than 256 x 192 pixels."""
     banks: tuple[Path, ...] = ()
     """Folders that rainstereo rain made of these images, to learn from in place of rain on crops of them."""
+    restored: tuple[Path, ...] = ()
+    """Folders that rainstereo derain --no-skip made of the banks, in the same order: what can be mended is then what
+    the detector looks for. Without them, all that the rain changed."""
     out: Path = Path("detector.safetensors")
     """File to write."""
     start: Path | None = None
@@ -47,7 +50,9 @@ class Options:
     batch: int = 8
     """Crops in a step."""
     pool: int = 1300
-    """Crops on which rain is rendered, once."""
+    """Images, or parts of them, under rain that are kept in memory."""
+    rate: float = 2e-3
+    """Learning rate at most; less to go on with weights that know something."""
     seed: int = 0
     """Decides everything that is drawn at random."""
 
@@ -55,6 +60,8 @@ class Options:
 def run(options: Options) -> int:
     """Train; 0."""
     record = Record("detector", options)
+    if not 0 < options.rate < 1:
+        raise ValueError(f"--rate {options.rate:g} was given; expected more than 0, and less than 1")
     if options.out.suffix != ".safetensors":
         raise ValueError(f"--out {options.out} was given; expected a name that ends in .safetensors")
     for name, low in (("steps", 10), ("batch", 2), ("pool", 2), ("seed", 0)):
@@ -67,7 +74,6 @@ def run(options: Options) -> int:
     named = {source.name: imagefile.read(source.path) for source in find(options.images) if not source.is_video}
     named = {name: image for name, image in named.items() if image.ndim == 3 and image.dtype == "uint8"}
     images = list(named.values())
-    recipe = detector_training.Recipe(options.steps, options.batch, options.pool, seed=options.seed)
     console, last = Console(stderr=True), {"rendering": 0, "reading": 0, "training": 0}
     with progress_bar(console) as told:
 
@@ -75,37 +81,47 @@ def run(options: Options) -> int:
             told(what, done - last[what], total)
             last[what] = done
 
-        rain = banked(named, options.banks, options.seed) if options.banks else rains()
+        rain: Callable[[int], Rained] | Sequence[RandomAdherentRain] = rains()
+        pool = options.pool
+        if options.banks:
+            rain, many = banked(named, options.banks, options.restored, options.seed)
+            pool = min(pool, many)
+        recipe = detector_training.Recipe(options.steps, options.batch, pool, rate=options.rate, seed=options.seed)
         made = detector_training.train(images, rain, recipe, told=progress, start=start)
     data = detector.packed(made.network)
     if len(data) > MOST_BYTES:
         raise ValueError(f"the weights have {len(data)} bytes; expected {MOST_BYTES} at most")
     write_atomically(options.out, data)
-    found = {"loss": made.loss, "harm_found": made.found, "cells_marked_falsely": made.false}
+    found = {"loss": made.loss, "gain_found": made.found, "cells_marked_falsely": made.false}
     card = {
         "name": "drop detector", "bytes": len(data), "training_images": len(images), "recipe": asdict(recipe),
-        "rain": _rain(options), "harm": f"squared change over {detector_training.HURTS:g} levels squared",
+        "rain": _rain(options), "worth": _worth(options, detector_training.MUCH),
         "held_out": found, "versions": {k: v for k, v in versions().items() if k in ("rainstereo", "torch")},
     }  # fmt: skip
     write_atomically(options.out.with_suffix(".toml"), to_toml(card).encode())
     record["held_out"], record["bytes"] = found, len(data)
     record.write(options.out.with_name(f"{options.out.stem}.report.json"))
     console.print(
-        f"{options.out}: {len(data)} bytes; of the harm in held-out crops {100 * made.found:.0f} % is in marked cells, "
-        f"of the cells without any {100 * made.false:.1f} % are marked",
+        f"{options.out}: {len(data)} bytes; of what can be gained in held-out crops {100 * made.found:.0f} % is in "
+        f"marked cells, of the cells without any {100 * made.false:.1f} % are marked",
         soft_wrap=True,
     )
     return DONE
 
 
-def banked(named: dict[str, Image], banks: Sequence[Path], seed: int) -> Callable[[int], Rained]:
-    """Images under rain, from folders of `rainstereo rain`: each is met once before any is met again."""
+def banked(
+    named: dict[str, Image], banks: Sequence[Path], restored: Sequence[Path], seed: int
+) -> tuple[Callable[[int], Rained], int]:
+    """Images under rain, from folders of `rainstereo rain`, and the same restored, of `derain`, if any; and how many:
+    each is met once before any is met again."""
     from rainstereo.model.detector_training import Rained
 
+    if restored and len(restored) != len(banks):
+        raise ValueError(f"--restored names {len(restored)} folders, --banks {len(banks)}; expected one for each")
     found = []
-    for bank in banks:
+    for number, bank in enumerate(banks):
         rainy = {path.stem: path for path in sorted(bank.glob("*.png"))}
-        both = [(name, rainy[name]) for name in sorted(named.keys() & rainy.keys())]
+        both = [(name, rainy[name], number) for name in sorted(named.keys() & rainy.keys())]
         found += both
         if not both:
             raise ValueError(
@@ -114,13 +130,20 @@ def banked(named: dict[str, Image], banks: Sequence[Path], seed: int) -> Callabl
     order = np.random.default_rng(seed).permutation(len(found))
 
     def rained(number: int) -> Rained:
-        name, rainy = found[order[number % len(found)]]
-        given = Rained(named[name], imagefile.read(rainy))
-        if given.rainy.shape != given.clear.shape:
-            raise ValueError(f"{rainy} has not the size of the clear image {name}; render it again")
+        name, rainy, bank = found[order[number % len(found)]]
+        better = imagefile.read(restored[bank] / rainy.name) if restored else None
+        given = Rained(named[name], imagefile.read(rainy), better)
+        for path, image in ((rainy, given.rainy), (rainy.name, better)):
+            if image is not None and image.shape != given.clear.shape:
+                raise ValueError(f"{path} has not the size of the clear image {name}; make it again")
         return given
 
-    return rained
+    return rained, len(found)
+
+
+def _worth(options: Options, much: float) -> str:
+    fall = "fall of the squared error by restoring" if options.restored else "squared change by rain"
+    return f"{fall}, over {much:g} levels squared, at most 1"
 
 
 def _rain(options: Options) -> str:

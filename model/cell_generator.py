@@ -145,14 +145,19 @@ class CellGenerator:
         return drawn.view(len(windows), out, out, -1).permute(0, 3, 1, 2)
 
     def _raised(self, layer: nn.ConvTranspose2d, features: Tensor, places: _Places) -> Tensor:
-        """A 3 x 3 transposed convolution of stride 2: 2 x 2 places beside each other make the 2 x 2 of the first."""
+        """A 3 x 3 transposed convolution of stride 2: 2 x 2 places beside each other make the 2 x 2 of the first, the
+        n-th of which sees no more than the first n of them."""
         count, channels, size = features.shape[:3]
         matrix, bias = self._matrix(layer, _transposed(layer), 2, features)
         wide = places.windows(features, 0, 1).permute(0, 2, 3, 1)
         four = [wide[:, i : i + size, j : j + size] for i in (0, 1) for j in (0, 1)]
-        drawn = functional.linear(torch.cat(four, 3).view(-1, 4 * channels), matrix, bias)
-        tiled = drawn.view(count, size, size, 2, 2, -1).transpose(2, 3)
-        return tiled.reshape(count, 2 * size, 2 * size, -1).permute(0, 3, 1, 2)
+        seen, made = torch.cat(four, 3).view(-1, 4 * channels), layer.out_channels
+        found = features.new_empty(count, size, 2, size, 2, made)
+        for number in range(4):
+            rows, columns = slice(number * made, (number + 1) * made), slice((number + 1) * channels)
+            drawn = functional.linear(seen[:, columns], matrix[rows, columns], None if bias is None else bias[rows])
+            found[:, :, number // 2, :, number % 2] = drawn.view(count, size, size, made)
+        return found.view(count, 2 * size, 2 * size, made).permute(0, 3, 1, 2)
 
     def _matrix(
         self, layer: nn.Conv2d | nn.ConvTranspose2d, run: Callable[[Tensor], Tensor], side: int, like: Tensor
@@ -205,6 +210,7 @@ class _Places:
         self.fewer = len(self.rows) < self.count
         self.device = device
         self._known: dict[tuple[int, int, int], Tensor] = {}
+        self._near: dict[int, Array] = {}
 
     def windows(self, features: Tensor, before: int, after: int) -> Tensor:
         """(N, C, k, k) -> (N, C, before + k + after, ...): each cell with what its neighbours hold beside it, or 0."""
@@ -215,16 +221,23 @@ class _Places:
         found = flat.index_select(0, self._around(size, before, after))
         return found.view(len(self.rows), wide, wide, channels).permute(0, 3, 1, 2)
 
+    def _numbers_around(self, reach: int) -> Array:
+        """(N, 2 reach + 1, 2 reach + 1): of the cells around each cell that is given."""
+        if reach not in self._near:
+            wide, step = np.pad(self.numbers, reach, constant_values=self.count), np.arange(2 * reach + 1)
+            rows, columns = self.rows[:, None, None] + step[:, None], self.columns[:, None, None] + step
+            self._near[reach] = wide[rows, columns]
+        return self._near[reach]
+
     def _around(self, size: int, before: int, after: int) -> Tensor:
         """Rows of the features of all cells, for each place of each window; after the last where none is."""
         key = (size, before, after)
         if key not in self._known:
-            down, right = self.numbers.shape
-            wide = np.full((down * size + before + after, right * size + before + after), self.count * size * size)
-            inside = wide[before : before + down * size, before : before + right * size]
-            place = np.arange(size * size).reshape(size, 1, size)
-            np.add(self.numbers[:, None, :, None] * size * size, place, out=inside.reshape(down, size, right, size))
-            found = _squares(wide, size, before + size + after)[self.rows, self.columns]
+            place = np.arange(-before, size + after)
+            cells, within = place // size, place % size
+            reach = max(-int(cells[0]), int(cells[-1]))
+            around = self._numbers_around(reach)[:, cells[:, None] + reach, cells + reach]
+            found = around * size**2 + (size * within[:, None] + within)
             self._known[key] = torch.from_numpy(found.reshape(-1)).to(self.device)
         return self._known[key]
 

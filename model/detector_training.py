@@ -1,15 +1,19 @@
-"""Trains the drop detector: clear images, rain rendered on them by this toolkit, and what the rain changed as truth.
+"""Trains the drop detector: clear images, rain rendered on them by this toolkit, and what restoring mends as truth.
 
-A cell's label is the harm done to it: the mean square change of its pixels, over that from which more counts no
-further. So the network's answer is the harm to expect, and what one hardly sees need not be found. A pool of rainy
-crops is rendered once; each step draws a batch of them, turned and recoloured anew. A share of the batch is clear:
-sharp, blurred, noisy or compressed, so that blur alone is not taken for a drop.
+A cell's label is what it is worth to restore it: by how much the mean square error of its pixels falls, over a fall
+from which more counts no further; below zero where restoring makes it worse. Where no restored images are given, all
+that the rain changed counts as mended. So the network's answer is the gain to expect, and what one hardly sees need not
+be found, nor what would not come out better. Each step cuts
+crops of images under rain anew, at every scale at which images are looked at, and alters them: of some, the rain is
+left in a band only, as a wiper leaves it; some are gray, some compressed. A share of the batch is clear: sharp,
+blurred, noisy or compressed, so that blur alone is not taken for a drop.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -21,20 +25,25 @@ from rainstereo.model.augment import RandomAdherentRain
 from rainstereo.model.detector import OWN, THRESHOLD, DetectorConfig, DropDetector
 from rainstereo.types import Image
 
-HURTS = 24.0
-"""Gray levels, RMS over a cell, of a change that is all the harm that a drop can do."""
+MUCH = 24.0
+"""Gray levels, RMS over a cell, of an error whose removal is all that a cell can be worth."""
+WORST = -0.3
+"""What a cell is worth, at least."""
 NONE = 0.01
-"""Harm below which a cell is as good as clear."""
+"""Worth below which a cell is as good as clear."""
+BANDS, GRAY, COMPRESSED, LEAST = 0.35, 0.15, 0.3, 0.35
+"""Shares of crops that have rain in a band only, are gray, are compressed, and are averaged down as far as they go."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How long, on what. size: (height, width) of the crops, in pixels of the averaged image. pool: rainy crops."""
+    """How long, on what. size: (height, width) of the crops, in pixels of the averaged image: half the least images
+    that are used. pool: images under rain that are kept."""
 
-    steps: int = 1500
-    batch: int = 16
-    pool: int = 640
-    size: tuple[int, int] = (192, 256)
+    steps: int = 4000
+    batch: int = 8
+    pool: int = 2500
+    size: tuple[int, int] = (176, 240)
     rate: float = 2e-3
     clear_share: float = 0.3
     seed: int = 0
@@ -42,24 +51,18 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Rained:
-    """An image, and the same under rain, both uint8 BGR."""
+    """An image, the same under rain, and that restored, if known; all uint8 BGR."""
 
     clear: Image
     rainy: Image
-
-
-@dataclass(frozen=True)
-class Pool:
-    """What is trained on. crops: (N, 3, H, W) uint8 RGB. labels: (N, 1, H / 4, W / 4), the harm there in 0..1."""
-
-    crops: Tensor
-    labels: Tensor
+    restored: Image | None = None
 
 
 @dataclass(frozen=True)
 class Trained:
     """The network; the mean loss of the last tenth of the steps; and of held-out crops, with what is above `THRESHOLD`
-    marked: which share of all harm is in marked cells, and which share of cells without any is marked all the same."""
+    marked: which share of all that can be gained is in marked cells, and which share of cells without any is marked,
+    too."""
 
     network: DropDetector
     loss: float
@@ -80,7 +83,7 @@ def train(
 ) -> Trained:
     """Train on clear images, uint8 BGR, all larger than the crops; rains are drawn from evenly.
 
-    rains: rain to put on crops of these images; or in its place images under rain, of which any number is asked for.
+    rains: rain to put on parts of these images; or in its place images under rain, of which any number is asked for.
     told: what is being done, how much of it is done, of how much. start: a network to go on with; it is changed.
     The same seed gives the same network on one machine.
     """
@@ -90,42 +93,45 @@ def train(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
         draws = np.random.default_rng(recipe.seed)
-        if callable(rains):
-            pool = cut(rains, recipe.pool, recipe.size, draws, told)
-        else:
-            pool = rendered(images, rains, recipe.pool, recipe.size, draws, told)
-        held = max(1, len(pool.crops) // 16)
-        network = (start or config.build()).train()
-        rest = Pool(pool.crops[held:], pool.labels[held:])
-        losses = _fit(network, rest, images, recipe, draws, told)
+        pool = []
+        for number in range(recipe.pool):
+            callable_ = callable(rains)
+            pool.append(rains(number) if callable(rains) else rendered(images, rains, number, recipe.size, draws))
+            told("reading" if callable_ else "rendering", number + 1, recipe.pool)
+        held = max(1, len(pool) // 16)
+        network = cast(Any, (start or config.build()).train()).to(memory_format=torch.channels_last)
+        losses = _fit(network, pool[held:] or pool, images, recipe, draws, told)
+        seen = [cut(one, recipe.size, draws) for one in pool[:held]]
     network.eval()
     with torch.inference_mode():
-        seen = network(pool.crops[:held].float() / 255).sigmoid() > THRESHOLD
-    harm = pool.labels[:held]
+        marked = network(torch.stack([rainy for rainy, _ in seen])).sigmoid() > THRESHOLD
+    worth = worth_of(torch.stack([gain for _, gain in seen]))
     tail = losses[-max(1, len(losses) // 10) :]
-    return Trained(network, float(np.mean(tail)), _share(seen, harm), _share(seen, (harm < NONE).float()))
+    return Trained(
+        network, float(np.mean(tail)), _share(marked, worth.clamp(0)), _share(marked, (worth < NONE).float())
+    )
 
 
 def _fit(
-    network: DropDetector, pool: Pool, images: Sequence[Image], recipe: Recipe, draws: np.random.Generator, told: Told
-) -> list[float]:
+    network: DropDetector, pool: Sequence[Rained], images: Sequence[Image], recipe: Recipe,
+    draws: np.random.Generator, told: Told,
+) -> list[float]:  # fmt: skip
     optimizer = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.rate, recipe.steps)
     clear = round(recipe.clear_share * recipe.batch)
     losses = []
     for step in range(recipe.steps):
-        chosen = torch.from_numpy(draws.integers(len(pool.crops), size=recipe.batch - clear))
-        rainy, truth = pool.crops[chosen].float() / 255, pool.labels[chosen]
-        if draws.random() < 0.5:
-            rainy, truth = rainy.flip(-1), truth.flip(-1)
-        dry = torch.stack([_as_tensor(spoiled(crop(images, recipe.size, draws), draws)) for _ in range(clear)] or [])
-        batch = torch.cat([rainy, dry.float() / 255]) if clear else rainy
-        truth = torch.cat([truth, torch.zeros(clear, *truth.shape[1:])])
-        gain = torch.from_numpy(draws.uniform(0.6, 1.4, (len(batch), 1, 1, 1)).astype(np.float32))
+        chosen = draws.integers(len(pool), size=recipe.batch - clear)
+        made = [cut(pool[i], recipe.size, draws, altered=True) for i in chosen]
+        dry = [as_tensor(spoiled(crop(images, recipe.size, draws), draws)) for _ in range(clear)]
+        batch = torch.stack([rainy for rainy, _ in made] + dry)
+        gain = torch.stack([gain for _, gain in made])
+        gain = torch.cat([gain, gain.new_zeros(clear, *gain.shape[1:])])
+        light = torch.from_numpy(draws.uniform(0.6, 1.4, (len(batch), 1, 1, 1)).astype(np.float32))
         tint = torch.from_numpy(draws.uniform(0.9, 1.1, (len(batch), 3, 1, 1)).astype(np.float32))
-        noise = torch.from_numpy((draws.random() * 0.02 * draws.standard_normal(batch.shape)).astype(np.float32))
-        logits = network((batch * gain * tint + noise).clamp(0, 1))
-        loss = functional.binary_cross_entropy_with_logits(logits, truth)
+        noise = torch.from_numpy(draws.standard_normal(batch.shape, np.float32)) * float(0.02 * draws.random())
+        logits = network((batch * light * tint + noise).clamp(0, 1).contiguous(memory_format=torch.channels_last))
+        loss = functional.binary_cross_entropy_with_logits(logits, worth_of(gain * light.square()))
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -136,80 +142,108 @@ def _fit(
 
 
 def rendered(
-    images: Sequence[Image], rains: Sequence[RandomAdherentRain], count: int, size: tuple[int, int],
-    draws: np.random.Generator, told: Told = lambda what, done, total: None,
-) -> Pool:  # fmt: skip
-    """Crops of clear images on which rain is put."""
-    found = []
-    for number in range(count):
-        clear = _as_tensor(spoiled(crop(images, size, draws), draws) if number % 4 == 3 else crop(images, size, draws))
-        rain = rains[number % len(rains)]
-        rainy = rain(clear.float().unsqueeze(0) / 255)
-        found.append(_labelled(clear, (255 * rainy[0]).round().clamp(0, 255).to(torch.uint8)))
-        told("rendering", number + 1, count)
-    return _pooled(found)
+    images: Sequence[Image], rains: Sequence[RandomAdherentRain], number: int, size: tuple[int, int],
+    draws: np.random.Generator,
+) -> Rained:  # fmt: skip
+    """Rain on a part of an image, up to twice as large as crops are."""
+    most = min(2.0, *(min(im.shape[0] / size[0], im.shape[1] / size[1]) for im in images))
+    clear = crop(images, (int(most * size[0]), int(most * size[1])), draws) if most >= 1 else crop(images, size, draws)
+    if number % 4 == 3:
+        clear = spoiled(clear, draws)
+    rainy = rains[number % len(rains)](as_tensor(clear).unsqueeze(0))[0]
+    levels = (255 * rainy).round().clamp(0, 255).byte().flip(0).permute(1, 2, 0)
+    return Rained(np.ascontiguousarray(clear), np.ascontiguousarray(levels.numpy()))
 
 
 def cut(
-    rained: Callable[[int], Rained], count: int, size: tuple[int, int], draws: np.random.Generator,
-    told: Told = lambda what, done, total: None,
-) -> Pool:  # fmt: skip
-    """Crops of images that are under rain already."""
-    found = []
-    for number in range(count):
-        given = rained(number)
-        part = crop([np.dstack([given.clear, given.rainy])], size, draws)
-        found.append(_labelled(_as_tensor(part[..., :3]), _as_tensor(part[..., 3:])))
-        told("reading", number + 1, count)
-    return _pooled(found)
+    given: Rained, size: tuple[int, int], draws: np.random.Generator, altered: bool = False
+) -> tuple[Tensor, Tensor]:
+    """A crop under rain, (3, H, W) RGB in 0..1, and what restoring gains in each of its cells, levels squared.
+
+    altered: some have rain in a band only, some are gray, some compressed.
+    """
+    better = given.clear if given.restored is None else given.restored
+    clear, rainy, better = same_part([given.clear, given.rainy, better], size, draws)
+    if altered and draws.random() < BANDS:
+        rainy, better = banded(clear, [rainy, better], draws)
+    if altered and draws.random() < GRAY:
+        clear, rainy, better = grayed(clear), grayed(rainy), grayed(better)
+    before, after = (np.square(cv2.absdiff(clear, one), dtype=np.float32) for one in (rainy, better))
+    if altered and draws.random() < COMPRESSED:
+        rainy = compressed(rainy, draws)
+    cells = functional.avg_pool2d(torch.from_numpy((before - after).mean(2))[None, None], OWN, ceil_mode=True)[0]
+    return as_tensor(rainy), cells
 
 
-def _labelled(clear: Tensor, rainy: Tensor) -> tuple[Tensor, Tensor]:
-    """A crop, and the harm done to each of its cells."""
-    change = (rainy.float() - clear.float()).square().mean(0, keepdim=True)
-    hurts = functional.avg_pool2d(change[None], OWN, ceil_mode=True)[0] / HURTS**2
-    return rainy, hurts.clamp(max=1)
+def banded(clear: Image, others: Sequence[Image], draws: np.random.Generator) -> list[Image]:
+    """Each of the others in a band of the image only, upright or level; the rest is clear."""
+    axis = int(draws.integers(2))
+    length = clear.shape[axis]
+    wide = int(length * draws.uniform(0.1, 0.6))
+    first = int(draws.integers(-wide // 2, length - wide // 2))
+    where = slice(max(0, first), max(0, first + wide))
+    part = (where, slice(None)) if axis == 0 else (slice(None), where)
+    found = [clear.copy() for _ in others]
+    for one, other in zip(found, others, strict=True):
+        one[part] = other[part]
+    return found
 
 
-def _pooled(found: Sequence[tuple[Tensor, Tensor]]) -> Pool:
-    crops, labels = zip(*found, strict=True)
-    return Pool(torch.stack(crops), torch.stack(labels))
+def worth_of(gain: Tensor) -> Tensor:
+    """Of what restoring gains, levels squared: 1 at most."""
+    return (gain / MUCH**2).clamp(WORST, 1)
 
 
 def crop(images: Sequence[Image], size: tuple[int, int], draws: np.random.Generator) -> Image:
-    """A part of one of the images, between the crop's own size and the whole, averaged down to that size; mirrored.
-    Images may have any number of channels."""
-    image = images[int(draws.integers(len(images)))]
-    height, width = image.shape[:2]
+    """A part of one of the images, between the crop's own size and the whole, averaged down to that size; mirrored."""
+    return same_part([images[int(draws.integers(len(images)))]], size, draws)[0]
+
+
+def same_part(images: Sequence[Image], size: tuple[int, int], draws: np.random.Generator) -> list[Image]:
+    """The same part of each of these images, as `crop` takes it."""
+    height, width = images[0].shape[:2]
     most = min(height / size[0], width / size[1])
     if most < 1:
         raise ValueError(f"an image has {width} x {height} pixels; expected at least {size[1]} x {size[0]}")
-    scale = draws.uniform(1, most)
+    scale = most if draws.random() < LEAST else draws.uniform(1, most)
     rows, columns = int(scale * size[0]), int(scale * size[1])
     top, left = int(draws.integers(height - rows + 1)), int(draws.integers(width - columns + 1))
-    part = image[top : top + rows, left : left + columns]
-    part = part[:, ::-1] if draws.random() < 0.5 else part
-    layers = [part[..., first : first + 3] for first in range(0, part.shape[2], 3)]  # OpenCV takes 4 at most
-    small = [cv2.resize(np.ascontiguousarray(layer), size[::-1], interpolation=cv2.INTER_AREA) for layer in layers]
-    return small[0] if len(small) == 1 else np.dstack(small)
+    mirrored = draws.random() < 0.5
+    found = []
+    for image in images:
+        part = image[top : top + rows, left : left + columns]
+        small = cv2.resize(part, size[::-1], interpolation=cv2.INTER_AREA)
+        found.append(cv2.flip(small, 1) if mirrored else small)
+    return cast(list[Image], found)
 
 
 def spoiled(image: Image, draws: np.random.Generator) -> Image:
-    """The image as a poor camera might have taken it: sharp, out of focus, shaken or compressed."""
+    """The image as a poor camera might have taken it: sharp, out of focus, shaken or compressed; some gray."""
     kind = int(draws.integers(4))
+    if draws.random() < GRAY:
+        image = grayed(image)
     if kind == 1:
         return np.asarray(cv2.GaussianBlur(image, (0, 0), draws.uniform(0.5, 3)))
     if kind == 2:
         length = int(draws.integers(2, 12))
         return np.asarray(cv2.blur(image, (length, 1)))
-    if kind == 3:
-        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(draws.integers(20, 90))])[1]
-        return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
-    return image
+    return compressed(image, draws) if kind == 3 else image
 
 
-def _as_tensor(image: Image) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1)))
+def grayed(image: Image) -> Image:
+    """Without colour, of three channels."""
+    return np.asarray(cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR))
+
+
+def compressed(image: Image, draws: np.random.Generator) -> Image:
+    """The image, from a JPEG file."""
+    data = cv2.imencode(".jpg", np.ascontiguousarray(image), [cv2.IMWRITE_JPEG_QUALITY, int(draws.integers(20, 95))])[1]
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
+
+
+def as_tensor(image: Image) -> Tensor:
+    """(H, W, 3) uint8 BGR -> (3, H, W) RGB in 0..1."""
+    return torch.from_numpy(np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1))).float() / 255
 
 
 def _share(marked: Tensor, of: Tensor) -> float:

@@ -28,13 +28,13 @@ from rainstereo.model import checkpoint as checkpoints
 from rainstereo.model import detector
 from rainstereo.model.architecture import ARCHITECTURES
 from rainstereo.model.cell_generator import CellGenerator, patches
-from rainstereo.model.detector import CELL, CERTAIN, THRESHOLD, UNIT, Detector, factor_for
+from rainstereo.model.detector import CELL, CERTAIN, EVIDENT, THRESHOLD, UNIT, Detector, factor_for
 from rainstereo.model.image_batch import INPUT
 from rainstereo.model.networks import Network, OnnxNetwork, TorchNetwork, pick_device
 from rainstereo.model.pixels import check, from_batch, from_rgb, to_batch, to_rgb
-from rainstereo.model.tiles import Grid, Rect, Rows, coarser, covering, ramped, strips
+from rainstereo.model.tiles import Grid, Rect, Rows, coarser, covering, mixed, ramped, strips
 from rainstereo.model.whole_frames import WholeFrames
-from rainstereo.types import Array, Image, Mask
+from rainstereo.types import Image, Mask
 
 Backend = Literal["torch", "onnx"]
 Checkpoint = str | os.PathLike[str]
@@ -75,9 +75,9 @@ class Restorer:
     the package's own. device: "auto", "cpu", "cuda", ... precision: "auto" (what pays there), "float32", "bf16",
     "float16". backend: "torch" or "onnx".
     tile: side, pixels, of the tiles of large images; None: by what may be computed at once, max_pixels.
-    skip: whether cells without drops are left as they are; threshold, certain: see `Detector`. halo: pixels that the
-    generator sees around what has drops; None: what pays. around: share of a whole image's cost up to which cells next
-    to those computed are looked at, too. A detector of one's own may be given.
+    skip: whether cells without drops are left as they are; threshold, certain, evident: see `Detector`. halo: pixels
+    that the generator sees around what has drops; None: what pays. around: share of a whole image's cost up to which
+    cells next to those computed are looked at, too. A detector of one's own may be given.
     network: in place of a checkpoint, anything that is a `Network`.
 
     ValueError where the checkpoint is not for such images.
@@ -86,8 +86,8 @@ class Restorer:
     def __init__(
         self, checkpoint: Checkpoint | None = None, device: str | torch.device = "auto", precision: str = "auto",
         tile: int | None = None, skip: bool = True, backend: Backend = "torch", *, threshold: float = THRESHOLD,
-        certain: float = CERTAIN, halo: int | None = None, around: float = AROUND, max_pixels: int = MAX_PIXELS,
-        detector: Detector | None = None, network: Network | None = None,
+        certain: float = CERTAIN, evident: float = EVIDENT, halo: int | None = None, around: float = AROUND,
+        max_pixels: int = MAX_PIXELS, detector: Detector | None = None, network: Network | None = None,
     ) -> None:  # fmt: skip
         if (halo is not None and halo < 0) or (tile is not None and tile < 4 * CELL) or max_pixels < 1 << 16:
             raise ValueError(
@@ -96,7 +96,7 @@ class Restorer:
             )
         self.network = network or _network(checkpoint, device, precision, backend)
         looks_on = self.network.device if self.network.device.type == "cuda" else "cpu"
-        self.detector = (detector or Detector.shipped(looks_on, threshold, certain)) if skip else None
+        self.detector = (detector or Detector.shipped(looks_on, threshold, certain, evident)) if skip else None
         step = self.network.multiple
         self.step = step if step % CELL == 0 else int(np.lcm(step, CELL))
         self.by_cells: CellGenerator | None = getattr(self.network, "cells", None)
@@ -234,12 +234,8 @@ class Restorer:
         like = given[:1, : made.cell, : made.cell]  # whose kind and channels count
         restored = from_batch(made(to_batch(given, self.network.device), where, looked), like)
         weight = patches(ramped(cells, CELL, (image.shape[0], image.shape[1]), RAMP), where, made.cell, 0)
-        before = patches(out, where, made.cell, 0)
-        mixed = restored.astype(np.float32)
-        mixed -= before
-        mixed *= weight[..., None] if out.ndim == 3 else weight
-        mixed += before
-        found = np.rint(mixed, out=mixed).astype(out.dtype)
+        tall = [each.reshape(-1, *each.shape[2:]) for each in (restored, patches(out, where, made.cell, 0), weight)]
+        found = mixed(*tall).reshape(restored.shape)
         for square, row, column in zip(found, *np.nonzero(where), strict=True):
             part = out[row * made.cell : (row + 1) * made.cell, column * made.cell : (column + 1) * made.cell]
             part[...] = square[: part.shape[0], : part.shape[1]]
@@ -294,19 +290,15 @@ def _pasted(out: Image, restored: Image, part: Rect, cells: Mask) -> Image:
     if cells.all():
         out[part.slices] = restored
         return out
-    weight: Array = ramped(cells, CELL, (part.bottom - part.top, part.right - part.left), RAMP)
-    if out.ndim == 3:
-        weight = weight[..., None]
-    given = out[part.slices]
-    mixed = given + weight * (restored.astype(np.float32) - given)
-    out[part.slices] = np.rint(mixed)
+    weight = ramped(cells, CELL, (part.bottom - part.top, part.right - part.left), RAMP)
+    out[part.slices] = mixed(restored, out[part.slices], weight)
     return out
 
 
 def leaves_out() -> str:
     """Changes when anything does that decides, by default, which cells are left as they are."""
     weights = detector.shipped().read_bytes()
-    settings = THRESHOLD, CERTAIN, UNIT, CELLS_HALO, PARTS_HALO, RAMP, BY_CELLS, LOOKING, AROUND, WHOLE, CALL
+    settings = THRESHOLD, CERTAIN, EVIDENT, UNIT, CELLS_HALO, PARTS_HALO, RAMP, BY_CELLS, LOOKING, AROUND, WHOLE, CALL
     return hashlib.sha256(weights + repr(settings).encode()).hexdigest()
 
 

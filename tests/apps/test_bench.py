@@ -4,6 +4,7 @@ import json
 import math
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -234,7 +235,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
             lost = work(*variants, targets=(Target("sum", "loop", 1e-9),))
             return Stage("tiny", "adding numbers", "Sums.", (lost,), {"seed": seed}, ())
 
-    monkeypatch.setattr(bench.importlib, "import_module", lambda name: Module)
+    monkeypatch.setattr(bench, "importlib", SimpleNamespace(import_module=lambda name: Module))
 
 
 @pytest.mark.usefixtures("tiny")
@@ -267,6 +268,32 @@ def test_quick_does_little(tmp_path: Path) -> None:
     bench.run(bench.Options("tiny", tmp_path, repeats=50, quick=True))
     read = json.loads((tmp_path / "tiny" / "report.json").read_text())
     assert len(read["works"]["w"]["variants"]["sum"]["samples"]) == 3
+
+
+def test_works_may_be_picked_out(tmp_path: Path) -> None:
+    def work(name: str) -> Work:
+        return Work(name, name, "", (Variant("one", lambda: 1, lambda found: 0.0),), "one", "", "")
+
+    def works() -> list[str]:
+        return list(json.loads((tmp_path / "two" / "report.json").read_text())["works"])
+
+    class Module:
+        @staticmethod
+        def build(seed: int, quick: bool) -> Stage:
+            return Stage("two", "t", "", (work("a"), work("b")))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(bench.STAGES, "two", "two")
+        patch.setattr(bench, "importlib", SimpleNamespace(import_module=lambda name: Module))
+        for name, value in bench.SINGLE_THREAD.items():
+            patch.setenv(name, value)
+        assert bench.run(bench.Options("two", tmp_path, repeats=1, only=("b",))) == 0
+        assert works() == ["b"]
+        assert "--only b" in (tmp_path / "two" / "two.md").read_text()
+        with pytest.raises(ValueError, match="the works of two are a, b"):
+            bench.run(bench.Options("two", tmp_path, repeats=1, only=("c",)))
+        with pytest.raises(ValueError, match="all stages were asked for"):
+            bench.run(bench.Options("all", tmp_path, only=("a",)))
 
 
 def test_unknown_stage_is_bad_usage_with_a_list(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

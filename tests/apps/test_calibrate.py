@@ -51,6 +51,7 @@ def test_thirteen_real_pairs(shared_data: Path, tmp_path: Path) -> None:
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
+@pytest.mark.slow
 def test_wide_lenses_with_flipped_boards(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "calib" / "stereopi_wide_640x480"
     assert calibrate(folder / "left*.png", folder / "right*.png", tmp_path / "rig") == 0
@@ -61,6 +62,7 @@ def test_wide_lenses_with_flipped_boards(shared_data: Path, tmp_path: Path) -> N
     assert not any("reversed" in finding["text"] for finding in told["findings"])
 
 
+@pytest.mark.slow
 def test_a_charuco_board_through_a_wide_lens(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "calib" / "charuco_wide_1280x800"
     board = "charuco:31x16:49.33mm:38.46mm:DICT_4X4_1000"
@@ -144,6 +146,7 @@ def test_a_board_that_never_moves_before_one_camera_is_refused(
     assert "one board that did not move" in words(capsys)
 
 
+@pytest.mark.slow
 def test_near_identical_views_are_refused(boards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     for role in ("dry", "wet"):
@@ -158,6 +161,7 @@ def test_near_identical_views_are_refused(boards: Path, tmp_path: Path, capsys: 
     assert "tilt" in told  # the remedy
 
 
+@pytest.mark.slow
 def test_a_refused_capture_leaves_an_earlier_rig_alone(recording: Path, boards: Path, tmp_path: Path) -> None:
     out = tmp_path / "rig"
     assert calibrate(boards / "dry", boards / "wet", out, "--lensmodel", "LENSMODEL_OPENCV5") == 0
@@ -170,6 +174,7 @@ def test_a_refused_capture_leaves_an_earlier_rig_alone(recording: Path, boards: 
     assert report(out / "refused")["status"] == "refused"
 
 
+@pytest.mark.slow
 def test_damaged_files_are_named_and_the_rest_suffices(boards: Path, tmp_path: Path) -> None:
     (boards / "dry" / "001.png").write_bytes(b"")
     data = (boards / "wet" / "002.png").read_bytes()
@@ -303,6 +308,7 @@ def test_a_solve_that_does_not_converge_writes_no_rig(
     assert report(tmp_path / "rig")["status"] == "refused"
 
 
+@pytest.mark.slow
 def test_frames_of_another_focus_are_told_apart(
     recording: Path, boards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

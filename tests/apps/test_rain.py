@@ -119,6 +119,7 @@ def test_the_drop_list_makes_the_frame_again(clear: Path, rainy: Path, tmp_path:
     assert contents(tmp_path / "again") == {"002.png": (rainy / "002.png").read_bytes()}
 
 
+@pytest.mark.slow
 def test_drops_that_touch_become_bodies_of_their_volume() -> None:
     """--merge, and the drop list makes the frame again, bodies and all."""
     setup = replace(PRESETS["drops"], population=PRESETS["drops"].population.with_cover(0.3), f_number=math.inf)
@@ -340,7 +341,7 @@ def test_labels_of_another_folder(clear: Path, tmp_path: Path, capsys: pytest.Ca
 # -- sequences ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("motion", ["physical", "paper", "still"])
+@pytest.mark.parametrize("motion", ["physical", "paper", pytest.param("still", marks=pytest.mark.slow)])
 def test_drops_stay_or_move_over_a_sequence(clear: Path, tmp_path: Path, motion: str) -> None:
     options = (*FEW, "--sequence", "--motion", motion, "--fps", "10")
     assert rain(clear, tmp_path / "out", *options) == 0

@@ -130,7 +130,10 @@ def test_two_equal_images_show_no_drop(clear: Image) -> None:
 # -- the fit -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("cover", "f_number", "scale", "gain_off"), [(0.2, 4.0, 1.0, 0.05), (0.4, 2.5, 1.4, 0.13)])
+@pytest.mark.parametrize(
+    ("cover", "f_number", "scale", "gain_off"),
+    [(0.2, 4.0, 1.0, 0.05), pytest.param(0.4, 2.5, 1.4, 0.13, marks=pytest.mark.slow)],
+)
 def test_cover_size_and_blur_of_known_rain_are_found(
     clear: Image, cover: float, f_number: float, scale: float, gain_off: float
 ) -> None:
@@ -175,6 +178,7 @@ def test_a_cut_camera_looks_where_the_whole_one_does(clear: Image) -> None:
     assert rays[0] == pytest.approx(rays[1], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_sheet_says_what_it_measured(clear: Image, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(realism, "SEEDS", 5)
     wet = rainy(clear, known(0.3, 4.0), seed=2)

@@ -133,6 +133,7 @@ def interrupted_when_idle(monkeypatch: pytest.MonkeyPatch) -> None:
 # -- the command ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_it_ends_when_the_target_is_met_with_the_rig_of_a_plain_calibration(
     folder: Folder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -161,6 +162,7 @@ def test_it_ends_when_the_target_is_met_with_the_rig_of_a_plain_calibration(
     assert (tmp_path / "rig" / "report.html").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("interrupted_when_idle")
 def test_ctrl_c_writes_what_there_is(folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.pairs(7)

@@ -1,5 +1,7 @@
 """Triangulation through the chamber: against minimisation by scipy, against OpenCV without panels, and its limits."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -78,7 +80,8 @@ def test_without_a_chamber_it_is_opencvs() -> None:
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         # undistorted to 1e-12, which takes more than OpenCV's five rounds
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-14)
-        flat = cv2.undistortPointsIter(pixels[:, None], K, camera.distortion, np.eye(3), np.eye(3), criteria)
+        undistort: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # one function from OpenCV 5 on
+        flat = undistort(pixels[:, None], K, camera.distortion, R=np.eye(3), P=np.eye(3), criteria=criteria)
         normalised.append(flat[:, 0].T)
         R = pose.rotation_matrix(camera.rt_cam_ref[:3])
         projections.append(np.column_stack([R, camera.rt_cam_ref[3:]]))

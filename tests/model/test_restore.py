@@ -14,7 +14,7 @@ from rainstereo.model import checkpoint
 from rainstereo.model.frame_sequence import FrameSequence
 from rainstereo.model.pixels import from_rgb, to_rgb
 from rainstereo.model.restore import Restorer
-from rainstereo.model.tiles import Grid, Rect, coarser, covering, ramped, strips
+from rainstereo.model.tiles import Grid, Rect, coarser, covering, mixed, ramped, strips
 from rainstereo.types import Image
 from tests.model.small_restorer import CONFIG, RedDetector, generator, network, picture, saved, with_drop
 
@@ -372,3 +372,16 @@ def test_cells_around_are_looked_at_where_that_is_cheap() -> None:
         assert changed[64:80, 64:80].any()
         changed[64:80, 64:80] = False
         assert not changed.any()
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_mixed_is_the_weighted_mean_and_bits_where_nothing_is_mixed(kind: type, channels: tuple[int, ...]) -> None:
+    rng, most = np.random.default_rng(3), np.iinfo(kind).max
+    one, other = (rng.integers(0, most, (37, 52, *channels), dtype=kind, endpoint=True) for _ in range(2))
+    weight = np.clip(rng.uniform(-0.5, 1.5, (37, 52)), 0, 1).astype(np.float32)
+    found, each = mixed(one, other, weight), weight.astype(float).reshape(37, 52, *(1,) * len(channels))
+    assert found.dtype == kind
+    assert np.abs(found - (each * one + (1 - each) * other)).max() <= 0.5 + most * 1e-5
+    np.testing.assert_array_equal(found[weight == 0], other[weight == 0])
+    np.testing.assert_array_equal(found[weight == 1], one[weight == 1])
