@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import intrinsic
+
+ir = cgutils.ir  # of llvmlite, which numba brings along
 
 
 def _hint(write: int) -> Any:

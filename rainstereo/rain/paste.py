@@ -26,7 +26,7 @@ from .texels import Texels
 from .words import BELOW, EVERY, PACKED, clip, packed, unpack
 
 SHIFT = UNIT.bit_length() - 1
-KEPT = 1 << 24  # taps up to which places of texels are kept
+KEPT = 5 << 22  # taps up to which all taps are kept ready for the loop: 4 bytes each
 SHORT, LONG = 20, 32  # bits of a place where a tap has 32 bits, and where it has 64
 MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
 ROWS = 1 << 14  # that are summed at a time: few enough for the caches
