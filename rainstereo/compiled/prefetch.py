@@ -7,7 +7,7 @@ from typing import Any
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-ir = cgutils.ir  # of llvmlite, which numba brings along
+ir: Any = vars(cgutils)["ir"]  # of llvmlite, which numba brings along
 
 
 def _hint(write: int) -> Any:
