@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
-
-
 SETTINGS: dict[str, Any] = {"nogil": True, "boundscheck": False, "error_model": "numpy"}
 
 
@@ -21,12 +21,21 @@ def inlined(loop: Loop) -> Loop:
 def compiled(loop: Loop) -> Loop:
     """The loop in machine code: it releases the lock, checks no index and divides as IEEE 754 says.
 
-    numba compiles anew when the loop's own file has changed. After a change to a part of it that another file holds,
-    remove `__pycache__/*.nb?`. Where neither the package's folder nor the user's cache can be written to, loops are
-    compiled in every process.
+    Where neither the package's folder nor the user's cache can be written to, it is compiled in every process.
     """
+    given, numba.config.CACHE_DIR = numba.config.CACHE_DIR, numba.config.CACHE_DIR or str(_kept())
     try:
         found = numba.njit(cache=True, **SETTINGS)(loop)
     except RuntimeError:  # numba: no place for the cache
         found = numba.njit(**SETTINGS)(loop)
+    finally:
+        numba.config.CACHE_DIR = given
     return cast(Loop, found)
+
+
+def _kept() -> Path:
+    """A folder for the machine code of these very sources: numba compiles anew when a loop's own file changes, but not
+    when a part of it does that another file holds."""
+    here = Path(__file__).parent
+    sources = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(here.glob("*.py"))))
+    return here / "__pycache__" / sources.hexdigest()[:16]
