@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import kornia
@@ -320,7 +320,7 @@ def _remap(image: Image, seed: int) -> Callable[[], Image]:
     rng = np.random.default_rng(seed)
     maps = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in image.shape[1::-1])), -1)
     maps += rng.uniform(-3, 3, maps.shape).astype(np.float32)
-    return lambda: cv2.remap(image, maps, np.zeros(0), cv2.INTER_LINEAR)
+    return lambda: cv2.remap(image, maps, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
 
 
 def _nothing(_: object) -> float:
@@ -358,7 +358,9 @@ class Truth:
         plain, found = image.astype(np.float32), []
         for first in range(0, len(self.rows), 256):
             part = slice(first, first + 256)
-            looked = cv2.remap(plain, self.source[part], np.zeros(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            looked = cv2.remap(
+                plain, self.source[part], cast("Any", None), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
             found.append((looked * self.gain[part, :, None]).mean(1))
         own = image[self.rows, self.columns] * (1 - self.hidden)[:, None]
         shown: Array = np.minimum(np.concatenate(found) + own, 255)  # a drop may be brighter than the bare pane
