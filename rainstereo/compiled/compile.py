@@ -23,13 +23,14 @@ def compiled(loop: Loop) -> Loop:
 
     Where neither the package's folder nor the user's cache can be written to, it is compiled in every process.
     """
-    given, numba.config.CACHE_DIR = numba.config.CACHE_DIR, numba.config.CACHE_DIR or str(_kept())
+    config = cast(Any, numba.config)
+    given, config.CACHE_DIR = config.CACHE_DIR, config.CACHE_DIR or str(_kept())
     try:
         found = numba.njit(cache=True, **SETTINGS)(loop)
     except RuntimeError:  # numba: no place for the cache
         found = numba.njit(**SETTINGS)(loop)
     finally:
-        numba.config.CACHE_DIR = given
+        config.CACHE_DIR = given
     return cast(Loop, found)
 
 

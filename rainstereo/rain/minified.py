@@ -24,6 +24,7 @@ from rainstereo.patch import LONGEST, Patch, folded_along
 from rainstereo.trace import BLOCK, clear_transmittance, trace
 from rainstereo.types import Array, Image, Indices, Mask, Status
 
+from .free_memory import give_back
 from .lookups import JOINED, Lookups
 from .pursuit import Pursuit
 from .quadtree import Quadtree
@@ -107,14 +108,18 @@ class Minifier:
         """What every pixel of the batches that a drop covers looks at."""
         tables: list[Lookups] = []
         small: list[Lookups] = []
-        taps = 0
+        taps = every = 0
         for table in self._one_by_one(batches):
+            every += len(table.texels)
             if taps + len(table.texels) > self._joined:  # before the next ones come: the memory of these serves them
                 tables += self._ordered(small)
                 taps = 0
             small.append(table)
             taps += len(table.texels)
-        return tables + self._ordered(small)
+        tables += self._ordered(small)
+        if every > LARGE:
+            give_back()
+        return tables
 
     def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
         return [table.ordered(self.camera.width) for table in Lookups.joined(tables, self._joined)]
