@@ -177,7 +177,14 @@ class CapTable:
         """A table of caps on the scene's face; groups: (N,) numbers kept with them."""
         rows = [(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps]
         table = np.concatenate([np.array(rows, dtype=np.float64).reshape(-1, 5), groups[:, None]], axis=1)
-        return cls(scene, table, np.stack([outlines.x, outlines.y, np.minimum(outlines.radius, FAR)], -1))
+        circles = np.stack([outlines.x, outlines.y, np.minimum(outlines.radius, FAR)], -1)
+        return cls._ordered(scene, table, circles)
+
+    @classmethod
+    def _ordered(cls, scene: CapScene, caps: Array, circles: Array) -> CapTable:
+        """With the caps in an order of their own, so that sums do not depend on the one in which they come."""
+        order = np.lexsort(caps[:, :5].T)
+        return cls(scene, caps[order], circles[order])
 
     @classmethod
     def joined(cls, parts: list[CapTable]) -> list[CapTable]:
@@ -186,7 +193,9 @@ class CapTable:
         for part in parts:
             found.setdefault(part.scene, []).append(part)
         return [
-            cls(scene, np.concatenate([part.caps for part in some]), np.concatenate([part.circles for part in some]))
+            cls._ordered(
+                scene, np.concatenate([part.caps for part in some]), np.concatenate([part.circles for part in some])
+            )
             for scene, some in found.items()
         ]
 

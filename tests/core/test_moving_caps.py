@@ -220,6 +220,17 @@ caps = st.lists(
 )  # fmt: skip
 
 
+def test_order_does_not_matter_where_many_overlap():
+    """Found by the property test below: equal caps, and larger ones over them."""
+    drops = [cap(0, 0, 1, 2), cap(0, 0, 1, 2), cap(0, 0, 1, 2), cap(0, 0, 2, 137), cap(0, 1, 2, 2)]
+    renderer = Renderer(CAMERA, PANE, DEPTH, moving=True)
+    flat: np.ndarray = np.full((300, 400), 100, dtype=np.uint8)
+    shown = renderer.plan(drops).apply(flat)
+    for seed in range(6):
+        some = [drops[i] for i in np.random.default_rng(seed).permutation(len(drops))]
+        np.testing.assert_array_equal(renderer.plan(some).apply(flat), shown)
+
+
 @settings(max_examples=25, deadline=None)
 @given(caps, st.randoms(use_true_random=False))
 def test_any_drops(drops, random):
