@@ -149,6 +149,7 @@ _PACKAGES = {
     "opencv": ("opencv-contrib-python-headless", "opencv-contrib-python", "opencv-python-headless", "opencv-python"),
     "mrcal": ("mrcal",),
     "torch": ("torch",),
+    "numba": ("numba",),
 }
 
 
