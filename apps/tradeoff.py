@@ -49,7 +49,8 @@ def error_against_time(
 
     times, errors : (N,) in `time_unit` and `unit`; low, high : (N,) ends of the spread of the time. ours : (N,) bool,
     drawn in colour; the others, peers, in gray. An error of zero is drawn at `floor` (a tenth of the smallest other
-    one by default) with an arrow down. Entries that are not finite are left out.
+    one by default) with an arrow down; where some are below zero, better than the yardstick, the axis runs through
+    zero and has no floor. Entries that are not finite are left out.
     """
     time, error = np.asarray(times, float).reshape(-1), np.asarray(errors, float).reshape(-1)
     same_length("names", names, "times", time)
@@ -58,7 +59,9 @@ def error_against_time(
     left = time if low is None else np.asarray(low, float).reshape(-1)
     right = time if high is None else np.asarray(high, float).reshape(-1)
     positive = error[np.isfinite(error) & (error > 0)]
+    signed = bool((error[np.isfinite(error)] < 0).any())
     bottom = floor if floor is not None else (positive.min() / 10 if positive.size else 1e-9)
+    bottom = -np.inf if signed else bottom
     marks = [
         Mark(name, time[i], max(error[i], bottom), left[i], right[i], bool(mine[i]), bool(error[i] <= bottom))
         for i, name in enumerate(names)
@@ -69,9 +72,14 @@ def error_against_time(
     for mark in marks:
         mark.draw(axes)
     _set_limits(axes.set_xlim, [end for mark in marks for end in (mark.low, mark.high)])
-    _set_limits(axes.set_ylim, [mark.error for mark in marks])
+    if signed:
+        axes.set_yscale("symlog", linthresh=0.1)
+        axes.margins(y=0.15)
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{float(f'{value:.2g}'):,g}"))
+    else:
+        _set_limits(axes.set_ylim, [mark.error for mark in marks])
     _name_ticks(axes.xaxis)
-    if np.divide(*axes.get_ylim()) > 1e-3:
+    if not signed and np.divide(*axes.get_ylim()) > 1e-3:
         _name_ticks(axes.yaxis)
     _label_apart(figure, axes, marks)
     corner: dict[str, Any] = {"xycoords": "axes fraction", "color": FAINT, "fontsize": 8.5, "style": "italic"}

@@ -273,6 +273,7 @@ MAKERS = {
     "frames": lambda: figures.frame_bars(["a.png", "b" * 60], [50, 40], [0, 9], [0.1, np.nan], limit=0.1),
     "no frames": lambda: figures.frame_bars([], [], []),
     "trade": lambda: error_against_time(["a", "b", "c"], [1, 2, 3], [0, 1e-9, np.nan], [0.9, 2, 3], [1.1, 2, 3]),
+    "through zero": lambda: error_against_time(["a", "b", "c"], [1, 2, 3], [-39, 0, 0.05], [0.9, 2, 3], [1.1, 2, 3]),
     "no trade": lambda: error_against_time(["a"], [np.nan], [1]),
     "same trade": lambda: error_against_time(["a", "b"], [1, 1], [1e-3, 1e-3]),
     "times": lambda: times_alone(["a", "b"], [1, 3], [0.9, 2], [1.1, 4], [True, False]),
@@ -376,3 +377,13 @@ def test_difference_is_gray_where_two_agree_and_signed_elsewhere() -> None:
     assert (overlays.difference(a, a + 100, gain=4) == 0).all()
     with pytest.raises(ValueError, match="same size"):
         overlays.difference(a, a[:1])
+
+
+def test_errors_below_zero_are_shown_where_they_are() -> None:
+    """PSNR lost may be negative: no mark is lifted to a floor, and none lies beyond the axis."""
+    axes = error_against_time(["a", "b"], [1.0, 2.0], [-0.2, 0.05]).axes[0]
+    low, high = axes.get_ylim()
+    assert low < -0.2
+    assert high > 0.05
+    assert sorted(float(line.get_ydata()[0]) for line in axes.get_lines()) == [-0.2, 0.05]
+    assert error_against_time(["a", "b"], [1.0, 2.0], [0.2, 0.05]).axes[0].get_yscale() == "log"
