@@ -93,11 +93,10 @@ def train(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
         draws = np.random.default_rng(recipe.seed)
-        pool = []
+        pool, doing = [], "reading" if callable(rains) else "rendering"
         for number in range(recipe.pool):
-            callable_ = callable(rains)
             pool.append(rains(number) if callable(rains) else rendered(images, rains, number, recipe.size, draws))
-            told("reading" if callable_ else "rendering", number + 1, recipe.pool)
+            told(doing, number + 1, recipe.pool)
         held = max(1, len(pool) // 16)
         network = cast(Any, (start or config.build()).train()).to(memory_format=torch.channels_last)
         losses = _fit(network, pool[held:] or pool, images, recipe, draws, told)

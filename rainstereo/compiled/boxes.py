@@ -2,7 +2,7 @@
 
 A box of 2^k pixels stands at every 2^(k - 2) (those of four pixels, at every second). Box j along an axis is centred on
 the edge between the pixels t j - 1 and t j, t their distance; beyond the image's edges it goes on mirrored, to about a
-pixel. Three channels of bytes stand in a word, 21 bits apart (`rain.lookups`), 64 times as large.
+pixel. Three channels of bytes stand in a word, 21 bits apart (`rain.words`), 64 times as large.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ from typing import Any
 import numpy as np
 
 from .compile import compiled
-
-FIELD = np.uint64(21)
-LOW = np.uint64(0xFF)
+from .layout import EVERY
 
 
 @compiled
@@ -24,16 +22,6 @@ def mirrored(j: Any, last: Any) -> Any:
     if j > last:
         j = 2 * last - j
     return max(j, 0)
-
-
-@compiled
-def spread(four: Any, words: Any) -> None:
-    """Words of pixels of four bytes, (N,) uint32: the first three bytes."""
-    middle, top = np.uint64(13), np.uint64(26)
-    second, third = np.uint64(0xFF00), np.uint64(0xFF0000)
-    for i in range(np.uint64(len(four))):
-        own = np.uint64(four[i])
-        words[i] = (own & LOW) | ((own & second) << middle) | ((own & third) << top)
 
 
 @compiled
@@ -75,7 +63,7 @@ def next_boxes(boxes: Any, larger: Any) -> None:
     """Boxes of twice the side, (h, w), at every second of the places of boxes, (H, W)."""
     height, width = larger.shape
     down, across = boxes.shape[0] - 1, boxes.shape[1] - 1
-    mask = np.uint64(0xFFFF | (0xFFFF << 21) | (0xFFFF << 42))
+    mask = np.uint64(0xFFFF * EVERY)
     two = np.uint64(2)
     for j in range(height):
         one, other = boxes[mirrored(2 * j - 2, down)], boxes[mirrored(2 * j + 2, down)]

@@ -36,9 +36,9 @@ from .cap_tiles import (
     widest,
 )  # fmt: skip
 from .compile import compiled
+from .layout import DRAW, FILL
 
 WHITE = np.float32(255)
-DRAW, COUNT, FILL = 0, 1, 2
 
 
 @compiled

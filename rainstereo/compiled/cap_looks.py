@@ -14,9 +14,10 @@ import numpy as np
 from .cap_rays import BLUE, GAIN, GREEN, HALF, HIDDEN, ONE, RED, SHARE, STEPS, SUB, Y_, ZERO
 from .cap_tiles import ABX, ABY, ACROSS, AREA, AX, AXX, AY, AYY, BX, BXX, BY, BYY, CX, CY, FAR, GAINS, LIT, LITS
 from .compile import compiled, inlined
+from .layout import FIELD as BITS
 
-FIELD, TWICE = np.uint64(21), np.uint64(42)
-MASK = np.uint64((1 << 21) - 1)
+FIELD, TWICE = np.uint64(BITS), np.uint64(2 * BITS)
+MASK = np.uint64((1 << BITS) - 1)
 SCALE = np.float32(1 / 64)  # of words
 MIRROR, EDGE = 0, 1
 WIDER = np.float32(1.44)
@@ -77,18 +78,31 @@ def place_on(rays: Any, j: Any, s: Any, t: Any) -> Any:
     return x + t * (rays[BX + j] + HALF * t * rays[BXX + j]), y + t * (rays[BY + j] + HALF * t * rays[BYY + j])
 
 
-@compiled
-def patch_of_pixels(scene: Any, last: Any, border: Any, rays: Any, j: Any, total: Any) -> None:
-    """The mean of a small patch, from the image itself; added to `total`, (C,)."""
+@inlined
+def sides(rays: Any, j: Any) -> Any:
+    """Looks along a small patch, across and down: some two pixels apart."""
     ax, ay, bx, by = rays[AX + j], rays[AY + j], rays[BX + j], rays[BY + j]
     across = min(max(int(HALF * min(np.float32(math.sqrt(ax * ax + ay * ay)), np.float32(64))) + 1, 2), MOST)
     down = min(max(int(HALF * min(np.float32(math.sqrt(bx * bx + by * by)), np.float32(64))) + 1, 2), MOST)
+    return across, down
+
+
+@inlined
+def look_at(rays: Any, j: Any, a: Any, b: Any, across: Any, down: Any, last: Any, border: Any) -> Any:
+    """Where look a, b of those along a small patch falls in the image."""
+    s, t = (np.float32(a) + HALF) / np.float32(across) - HALF, (np.float32(b) + HALF) / np.float32(down) - HALF
+    x, y = place_on(rays, j, s, t)
+    return folded(x, last[0], border), folded(y, last[1], border)
+
+
+@compiled
+def patch_of_pixels(scene: Any, last: Any, border: Any, rays: Any, j: Any, total: Any) -> None:
+    """The mean of a small patch, from the image itself; added to `total`, (C,)."""
+    across, down = sides(rays, j)
     part = ONE / np.float32(across * down)
     for b in range(down):
-        t = (np.float32(b) + HALF) / np.float32(down) - HALF
         for a in range(across):
-            x, y = place_on(rays, j, (np.float32(a) + HALF) / np.float32(across) - HALF, t)
-            x, y = folded(x, last[0], border), folded(y, last[1], border)
+            x, y = look_at(rays, j, a, b, across, down, last, border)
             for channel in range(scene.shape[2]):
                 total[channel] += part * pixel_value(scene, x, y, channel)
 

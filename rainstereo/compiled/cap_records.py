@@ -6,18 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from .cap_looks import (
-    AREAS,
-    MOST,
-    WIDER,
-    areas,
-    folded,
-    place_on,
-    places,
-    size_of,
-)  # fmt: skip
+from .cap_looks import AREAS, WIDER, areas, folded, look_at, places, sides, size_of
 from .cap_rays import GAIN, HALF, HIDDEN, ONE, SHARE, SUB, Y_, ZERO
-from .cap_tiles import ACROSS, AREA, AX, AY, BX, BY, FAR, GAINS
+from .cap_tiles import ACROSS, AREA, FAR, GAINS
 from .compile import compiled, inlined
 
 PIXELS, TAPS = 0, 1  # counters
@@ -65,15 +56,11 @@ def record_whole(
         for look in range(count):
             _tap(texels, weights, cursor, filling, starts[k] + np.int64(at[look]), gain / np.float32(count))
         return
-    ax, ay, bx, by = rays[AX + j], rays[AY + j], rays[BX + j], rays[BY + j]
-    across = min(max(int(HALF * min(np.float32(np.sqrt(ax * ax + ay * ay)), np.float32(64))) + 1, 2), MOST)
-    down = min(max(int(HALF * min(np.float32(np.sqrt(bx * bx + by * by)), np.float32(64))) + 1, 2), MOST)
+    across, down = sides(rays, j)
     part = gain / np.float32(across * down)
     for b in range(down):
-        t = (np.float32(b) + HALF) / np.float32(down) - HALF
         for a in range(across):
-            x, y = place_on(rays, j, (np.float32(a) + HALF) / np.float32(across) - HALF, t)
-            x, y = folded(x, last[0], border), folded(y, last[1], border)
+            x, y = look_at(rays, j, a, b, across, down, last, border)
             _bilinear(texels, weights, cursor, filling, first, size, x, y, part)
 
 

@@ -117,10 +117,25 @@ def trace_lanes(
     cross(cap, later, view, rays, begin, end, to)
 
 
+@inlined
+def bent(rays: Any, j: Any, crossed: Any) -> Any:
+    """A coordinate of what a pixel shows, as a quadratic in the place on it: `CX`, `AX`, `BX`, `AXX`, `BXX`, `ABX`; and
+    how far from its middle's it goes, at most. j: of the lane, among x or y. crossed: no more than 0 if a ray beside a
+    corner is dark."""
+    quarter, eighth, one, two = np.float32(0.25), np.float32(0.125), np.uint64(1), np.uint64(2)
+    c, a, b = rays[OWN + j], rays[SIDES + j], rays[SIDES + j + one]
+    d, e = rays[ABOVE + j + one], rays[BELOW + j + one]
+    mixed = (rays[BELOW + j + two] - rays[BELOW + j]) - (rays[ABOVE + j + two] - rays[ABOVE + j])
+    mixed = HALF * mixed if crossed > ZERO else ZERO  # what is beside a dark ray may be NaN
+    ax, bx, axx, bxx = b - a, e - d, FOUR * (a + b - c - c), FOUR * (d + e - c - c)
+    reach = HALF * (abs(ax) + abs(bx)) + eighth * (abs(axx) + abs(bxx)) + quarter * abs(mixed)
+    return c, ax, bx, axx, bxx, mixed, reach
+
+
 @compiled
 def patches(rays: Any, low: Any, high: Any, looks: Any, most: Any, shift: Any, last: Any) -> None:
     """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel."""
-    quarter, eighth, sixth = np.float32(0.25), np.float32(0.125), np.float32(1 / 6)
+    sixth = np.float32(1 / 6)
     one, two = np.uint64(1), np.uint64(2)
     dx, dy, end_x, end_y = shift[0], shift[1], last[0], last[1]
     number, limit, fewest = np.float32(looks), np.float32(most), np.float32(min(2, most))
@@ -132,28 +147,16 @@ def patches(rays: Any, low: Any, high: Any, looks: Any, most: Any, shift: Any, l
         q = rays[BELOW + GAIN + j + two]
         p = p if p < q else q
         crossed = p
-        c, a, b = rays[OWN + j], rays[SIDES + j], rays[SIDES + j + one]
-        d, e = rays[ABOVE + j + one], rays[BELOW + j + one]
-        mixed = (rays[BELOW + j + two] - rays[BELOW + j]) - (rays[ABOVE + j + two] - rays[ABOVE + j])
-        mixed = HALF * mixed if crossed > ZERO else ZERO  # what is beside a dark ray may be NaN
-        ax, bx, axx, bxx = b - a, e - d, FOUR * (a + b - c - c), FOUR * (d + e - c - c)
+        c, ax, bx, axx, bxx, mixed, rx = bent(rays, j, crossed)
         cx = c + dx
-        rx = HALF * (abs(ax) + abs(bx)) + eighth * (abs(axx) + abs(bxx)) + quarter * abs(mixed)
         rays[CX + j] = cx
         rays[AX + j] = ax
         rays[BX + j] = bx
         rays[AXX + j] = axx
         rays[BXX + j] = bxx
         rays[ABX + j] = mixed
-        c, a, b = rays[OWN + Y_ + j], rays[SIDES + Y_ + j], rays[SIDES + Y_ + j + one]
-        d, e = rays[ABOVE + Y_ + j + one], rays[BELOW + Y_ + j + one]
-        mixed = (rays[BELOW + Y_ + j + two] - rays[BELOW + Y_ + j]) - (
-            rays[ABOVE + Y_ + j + two] - rays[ABOVE + Y_ + j]
-        )
-        mixed = HALF * mixed if crossed > ZERO else ZERO  # what is beside a dark ray may be NaN
-        ay, by, ayy, byy = b - a, e - d, FOUR * (a + b - c - c), FOUR * (d + e - c - c)
+        c, ay, by, ayy, byy, mixed, ry = bent(rays, Y_ + j, crossed)
         cy = c + dy
-        ry = HALF * (abs(ay) + abs(by)) + eighth * (abs(ayy) + abs(byy)) + quarter * abs(mixed)
         rays[CY + j] = cy
         rays[AY + j] = ay
         rays[BY + j] = by

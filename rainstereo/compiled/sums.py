@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rainstereo.rain.words import BELOW, EVERY, FIELD
-
 from .compile import compiled
+from .layout import BELOW, EVERY, FIELD
 from .prefetch import to_read, to_write
+from .words import word_of
 
 U = np.uint64
 ONE = U(EVERY)
@@ -61,7 +61,7 @@ def sum_words(
     weight's unit. pixels: (M,) uint32. bits, most, taps: as `interleave` writes them, and `AHEAD` taps more.
     roundings, clear: (M,) uint32, uint16, units of weights; the first for every channel, with `BELOW` in it.
     """
-    start, middle, last = U(first), U(first + 1), U(first + 2)
+    start = U(first)
     flat, mask = out.ravel(), (U(1) << U(bits)) - U(1)
     tap, end = U(0), U(len(pixels)) - U(1)
     for four in range(U(len(most))):
@@ -86,18 +86,13 @@ def sum_words(
             pixel = U(pixels[row])
             total = own + ONE * U(roundings[row])
             if clear[row]:
-                beneath = U(below[pixel, start])
-                if channels > 1:
-                    beneath |= U(below[pixel, middle]) << U(FIELD)
-                if channels > 2:
-                    beneath |= U(below[pixel, last]) << U(2 * FIELD)
-                total += beneath * U(clear[row])
+                total += word_of(below, pixel, start, channels) * U(clear[row])
             total = _clipped(total >> U(shift))
             out[pixel, start] = np.uint8(total & U(255))
             if channels > 1:
-                out[pixel, middle] = np.uint8((total >> U(FIELD)) & U(255))
+                out[pixel, start + U(1)] = np.uint8((total >> U(FIELD)) & U(255))
             if channels > 2:
-                out[pixel, last] = np.uint8((total >> U(2 * FIELD)) & U(255))
+                out[pixel, start + U(2)] = np.uint8((total >> U(2 * FIELD)) & U(255))
             row += U(1)
 
 

@@ -6,40 +6,37 @@ from typing import Any
 
 import numpy as np
 
-from rainstereo.rain.words import COLUMNS, EVERY, FIELD, QUARTERS, ROWS
-
-from .compile import compiled
+from .compile import compiled, inlined
+from .layout import COLUMNS, EVERY, FIELD, QUARTERS, ROWS
 
 U = np.uint64
 HALF, QUARTER = U(EVERY), U(2 * EVERY)  # what rounds means of two and of four: halves up
 BYTES = U(255 * EVERY)
 
 
+@inlined
+def word_of(values: Any, row: Any, first: Any, channels: int) -> Any:
+    """The word of a row of bytes, (N, C) uint8, from some channels on: up to three of them."""
+    word = U(values[row, first])
+    if channels > 1:
+        word |= U(values[row, first + U(1)]) << U(FIELD)
+    if channels > 2:
+        word |= U(values[row, first + U(2)]) << U(2 * FIELD)
+    return word
+
+
 @compiled
 def pack(values: Any, first: int, channels: int, words: Any) -> None:
     """Write a word for each row of bytes, (N, C) uint8, from some channels on: up to three of them; words: (N,)."""
-    start, middle, last = U(first), U(first + 1), U(first + 2)
     for i in range(U(len(words))):
-        word = U(values[i, start])
-        if channels > 1:
-            word |= U(values[i, middle]) << U(FIELD)
-        if channels > 2:
-            word |= U(values[i, last]) << U(2 * FIELD)
-        words[i] = word
+        words[i] = word_of(values, i, U(first), channels)
 
 
 @compiled
 def pack_some(values: Any, first: int, channels: int, rows: Any, words: Any) -> None:
     """The same of some rows, (n,) uint32; words: (n,)."""
-    start, middle, last = U(first), U(first + 1), U(first + 2)
     for i in range(U(len(rows))):
-        row = U(rows[i])
-        word = U(values[row, start])
-        if channels > 1:
-            word |= U(values[row, middle]) << U(FIELD)
-        if channels > 2:
-            word |= U(values[row, last]) << U(2 * FIELD)
-        words[i] = word
+        words[i] = word_of(values, U(rows[i]), U(first), channels)
 
 
 @compiled

@@ -18,6 +18,7 @@ from scipy.sparse import csr_array
 from rainstereo import fresnel, panel_plane
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
+from rainstereo.compiled.layout import COUNT, DRAW, FILL
 from rainstereo.drop_stack import DropStack
 from rainstereo.droplet import SphericalCap
 from rainstereo.lens import fold_radius
@@ -25,9 +26,9 @@ from rainstereo.panel_plane import PanelFrame
 from rainstereo.refraction import backproject
 from rainstereo.types import Array, Image, Indices, Mask
 
+from .boxes import Boxes
 from .contacts import touching
 from .outlines import Outlines
-from .overlapping import Boxes
 
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
@@ -264,7 +265,7 @@ class CapTable:
 
     def draw(self, image: Image, out: Image, words: Any) -> None:
         """Draw into a frame of up to three channels of bytes, (H, W, C), which holds the clear image."""
-        self.scene.go(0, out, image, words, self, _record(0, 0))
+        self.scene.go(DRAW, out, image, words, self, _record(0, 0))
 
     def values(self, image: Image, below: Image) -> Array:
         """What the table's pixels show, (M, C) float32, of any image (h, w, C); below: the frame's part of it."""
@@ -307,10 +308,10 @@ class CapTable:
         out, image = (np.zeros((h, w, 0), dtype=np.uint8) for w, h in ((width, height), self.scene.size))
         words = np.zeros(self.scene.boxes.count, dtype=np.uint64)
         record = _record(0, 0)
-        self.scene.go(1, out, image, words, self, record)
+        self.scene.go(COUNT, out, image, words, self, record)
         pixels, taps = record[-1].tolist()
         record = _record(pixels, taps)
-        self.scene.go(2, out, image, words, self, record)
+        self.scene.go(FILL, out, image, words, self, record)
         return _Tabulated(*record[:-1])
 
 

@@ -17,13 +17,14 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rainstereo import compiled
+from rainstereo.compiled.layout import BELOW, EVERY, PACKED
 from rainstereo.types import Image
 
 from .lookups import Lookups
 from .pyramid import copies, copy_starts
 from .quadtree import UNIT
 from .texels import Texels
-from .words import BELOW, EVERY, PACKED, clip, packed, unpack
+from .words import clip, packed, unpack
 
 SHIFT = UNIT.bit_length() - 1
 KEPT = 5 << 22  # taps up to which all taps are kept ready for the loop: 4 bytes each

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from rainstereo import compiled
+from rainstereo.compiled.layout import COLUMNS, QUARTERS, ROWS
 from rainstereo.types import Image, Mask
 
 from . import words
 from .pyramid import Copy, copies, copy_starts, half, sizes
-from .words import COLUMNS, QUARTERS, ROWS
 
 SPARSE = 0.4  # share of a level's texels below which they are picked out one by one
 

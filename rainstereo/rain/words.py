@@ -12,16 +12,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rainstereo.compiled.layout import BELOW, EVERY, FIELD, PACKED
 from rainstereo.types import Image
 
-FIELD = 21  # bits of a channel in a word
-PACKED = 3  # channels in a word
-EVERY = 1 + (1 << FIELD) + (1 << (2 * FIELD))
-BELOW = 128  # gray levels below 0 that a sum has room for: weights can be negative
 LITTLE = sys.byteorder == "little"
 CHUNK = 1 << 14  # words: few enough for the caches
-QUARTERS, COLUMNS, ROWS = 0, 1, 2
-"""How a copy of an image is made of another: means over 2 x 2 texels, over pairs of columns, over pairs of rows."""
 
 
 def packed(values: Image) -> Any:

@@ -12,12 +12,13 @@ from rainstereo import Camera, Chamber, Panel
 from rainstereo.compiled import available
 from rainstereo.droplet import SphericalCap
 from rainstereo.rain import render
+from rainstereo.rain.boxes import SCALE, Boxes
 from rainstereo.rain.drops import Drops
 from rainstereo.rain.moving_caps import CapScene, CapTable
 from rainstereo.rain.outlines import Outlines
-from rainstereo.rain.overlapping import SCALE, Boxes
 from rainstereo.rain.render import Renderer, Surround
 from rainstereo.trace import GRAZING, Fate, clear_transmittance, trace
+from tests.core.unknown_content import check_unknown
 
 from .test_render import CAMERA, DEPTH, PANE, SCENES, TWO, brute_force, cap, photograph, rms
 
@@ -157,11 +158,7 @@ def test_what_is_said_of_pixels_is_what_is_drawn():
     inside = cv2.erode((seen.status == Fate.THROUGH).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     moved = seen.source - np.stack(np.meshgrid(np.arange(400.0), np.arange(300.0)), -1)
     assert np.median(np.abs(plan.displacement - moved)[inside]) < 0.05
-    outside = inside & ((seen.source < -2) | (seen.source > [401, 301])).any(-1)
-    within = inside & ((seen.source > 40) & (seen.source < [359, 259])).all(-1)
-    assert outside.any()
-    assert plan.unknown[outside].all()
-    assert not plan.unknown[within].any()
+    check_unknown(plan.unknown, seen.source, inside, inside)
 
 
 def test_nothing_and_the_invisible():

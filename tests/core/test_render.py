@@ -25,6 +25,7 @@ from rainstereo.rain.streaks import Streak
 from rainstereo.thin_lens import ThinLens
 from rainstereo.trace import Fate, clear_transmittance, trace
 from rainstereo.young_laplace_drop import YoungLaplaceDrop
+from tests.core.unknown_content import check_unknown
 
 CAMERA = Camera.pinhole(800, 800, 199.5, 149.5, 400, 300)
 PANE = Chamber((0, 0, 1), 0.057, (Panel(0.003, 1.49),))
@@ -221,11 +222,7 @@ def test_what_is_known_of_the_pixels():
     clear = cv2.erode(beside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     assert not plan.displacement[clear].any()
     assert not plan.opacity[clear].any()
-    outside = through & ((seen.source < -2) | (seen.source > [401, 301])).any(-1)
-    within = inside & ((seen.source > 40) & (seen.source < [359, 259])).all(-1)
-    assert outside.any()
-    assert plan.unknown[outside].all()
-    assert not plan.unknown[within].any()
+    check_unknown(plan.unknown, seen.source, through, inside)
 
 
 def test_a_wider_image_shows_what_mirrors_make_up():

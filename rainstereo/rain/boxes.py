@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import cv2
 import numpy as np
 
 from rainstereo.types import Array, Image
@@ -20,7 +19,6 @@ from .pyramid import half
 SCALE = 64  # of bytes in words
 SECOND = 2  # pixels between the boxes of the first two sizes
 LARGEST = 10  # boxes of 2^10 pixels
-BIAS = 0.125  # gray levels by which OpenCV's mean of four bytes is too large: it rounds halves up
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +54,11 @@ class Boxes:
     def words(self, image: Image) -> Any:
         """All boxes of bytes, (H, W, 1 or 3), as (count,) uint64."""
         from rainstereo.compiled import boxes as loops
+        from rainstereo.compiled.words import pack
 
         small = half(image)
-        four = cv2.cvtColor(small, cv2.COLOR_GRAY2BGRA if small.shape[2] == 1 else cv2.COLOR_BGR2BGRA)
-        cells = np.empty(four.shape[:2], dtype=np.uint64)
-        loops.spread(four.view(np.uint32).ravel(), cells.ravel())
+        cells = np.empty(small.shape[:2], dtype=np.uint64)
+        pack(small.reshape(cells.size, -1), 0, small.shape[2], cells.ravel())
         found = np.empty(self.count, dtype=np.uint64)
         loops.first_boxes(cells, self.part(found, 0), self.part(found, 1))
         for k in range(2, len(self.start)):

@@ -1,0 +1,13 @@
+"""Numbers that loops share with their counterparts in numpy; part of the machine code, so they stand in this folder.
+
+A word of 64 bits holds three bytes, 21 bits apart (`rain.words`).
+"""
+
+FIELD = 21  # bits of a channel in a word
+PACKED = 3  # channels in a word
+EVERY = 1 + (1 << FIELD) + (1 << (2 * FIELD))
+BELOW = 128  # gray levels below 0 that a sum has room for: weights can be negative
+QUARTERS, COLUMNS, ROWS = 0, 1, 2
+"""How a copy of an image is made of another: means over 2 x 2 texels, over pairs of columns, over pairs of rows."""
+DRAW, COUNT, FILL = 0, 1, 2
+"""What the loops over caps do: draw a frame, count its pixels and taps, or write them down."""
