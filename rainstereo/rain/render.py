@@ -172,7 +172,7 @@ class Renderer:
             if panel is None:
                 others += some
             else:
-                tables += self._of_caps(panel, [groups[i] for i in some], given[some])
+                tables += self._of_caps([groups[i] for i in some], given[some])
         if others:
             tables += self._single_ray.tables(self._batches([groups[i] for i in others], given[others]))
         return tables
@@ -182,30 +182,28 @@ class Renderer:
         if not drops or not all(isinstance(drop, SphericalCap) for drop in drops):
             return None
         caps = [drop for drop in drops if isinstance(drop, SphericalCap)]
-        scene = (
-            self._cap_scene(caps[0].panel)
-            if {(cap.panel, cap.face) for cap in caps} == {(caps[0].panel, "far")}
-            else None
-        )
+        if {(cap.panel, cap.face) for cap in caps} != {(caps[0].panel, "far")}:
+            return None
+        table = self._cap_table(caps, Outlines.of(caps, self.camera, self.chamber), np.arange(len(caps)))
+        return table if table is None else (table,) * (len(table.caps) > 0)
+
+    def _cap_table(self, caps: Sequence[SphericalCap], outlines: Outlines, numbers: Indices) -> CapTable | None:
+        """Those caps on one panel's far face that the image shows; None if compiled loops cannot draw them."""
+        scene = self._cap_scene(caps[0].panel)
         if scene is None or min(cap.index for cap in caps) < 1:
             return None
-        outlines = Outlines.of(caps, self.camera, self.chamber)
-        shown = np.flatnonzero(outlines.radius > 0)
-        if not shown.size:
-            return ()
         check_places(caps, self.chamber, self.depth)
-        seen = [caps[i] for i in shown]
-        return (CapTable.of(scene, seen, outlines.take(shown), shown),)
+        shown = np.flatnonzero(outlines.radius > 0)
+        return CapTable.of(scene, [caps[i] for i in shown], outlines.take(shown), numbers[shown])
 
-    def _of_caps(self, panel: int, groups: Sequence[Group], numbers: Indices) -> list[Any]:
-        """Tables of caps on a panel's far face."""
+    def _of_caps(self, groups: Sequence[Group], numbers: Indices) -> list[Any]:
+        """Tables of caps on one panel's far face."""
         caps = [drop for group in groups for drop in group.drops if isinstance(drop, SphericalCap)]
         outlines = Outlines.joined([group.outlines for group in groups])
         of_cap = np.repeat(numbers, [len(group.drops) for group in groups])
-        scene = self._cap_scene(panel)
-        if scene is not None and min(cap.index for cap in caps) >= 1:
-            check_places(caps, self.chamber, self.depth)
-            return [CapTable.of(scene, caps, outlines, of_cap)]
+        table = self._cap_table(caps, outlines, of_cap)
+        if table is not None:
+            return [table]
         pixels, which = outlines.pixels()
         return self._single_ray.tables_of_caps(caps, pixels, which, of_cap[which])
 

@@ -394,6 +394,14 @@ def test_senseless_raw_sizes_are_refused(weights: Path, tmp_path: Path, capsys: 
         assert "expected WIDTHxHEIGHTx3" in " ".join(capsys.readouterr().err.split())
 
 
+def test_a_glob_means_the_files_that_fit_it(weights: Path, tmp_path: Path) -> None:
+    for name in ("a.png", "b.png", "c.bmp"):
+        put(tmp_path / "in" / name, picture(4))
+    assert run(weights, tmp_path / "in" / "*.png", tmp_path / "out", *FAST) == 0
+    assert report(tmp_path / "out")["made"] == 2
+    assert not list((tmp_path / "out").rglob("c.*"))
+
+
 def test_a_folder_that_is_not_ours_is_left_alone(tmp_path: Path) -> None:
     folder = Folder(tmp_path, "key")
     folder.claim(overwrite=False)
