@@ -118,7 +118,7 @@ def _store(builder: Any, value: Any, at: Any, channels: int) -> None:
 one_channel, two_channels, three_channels, four_channels = (_summing(channels) for channels in (1, 2, 3, 4))
 """three_channels(out, quads, shift, pixels, row, taps, first, end, roundings): the pixels of rows row to row + 7.
 
-out: (P * 3,) uint8. quads: (N,) uint32. shift: uint32, bits of a weight's unit. pixels: (M,) uint32. taps: signed, those
-of the rows from the number `first` to before `end`, interleaved (`sums.interleave`). roundings: (M,) int32, to which
-sums are added.
+out: (P * 3,) uint8. quads: (N,) uint32. shift: uint32, bits of a weight's unit. pixels: (M,) uint32. taps: signed,
+those of the rows from the number `first` to before `end`, interleaved (`sums.interleave`). roundings: (M,) int32, to
+which sums are added.
 """

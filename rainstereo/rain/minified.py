@@ -2,9 +2,9 @@
 
 A drop shows the scene small: neighbouring pixels may look 50 pixels apart. A pixel's value is the mean over its area,
 taken here from `rays_along` squared rays, each of which stands for its part of the area (`pursuit`, `quadtree`). Two
-rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more. At the outline
-of a drop there are twice as many along a side, since they also tell how much of the pixel the drop hides: of 8 x 8 that
-share is wrong by 0.013 or so, which is more gray levels than all else.
+rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more. In plans that
+last there are twice as many along a side at the outline of a drop, since they also tell how much of the pixel the drop
+hides: of 8 x 8 that share is wrong by 0.013 or so, which is more gray levels than all else.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
 from rainstereo.drop_grid import NOBODY
 from rainstereo.droplet import Drop
-from rainstereo.patch import LONGEST, Patch, folded_along
+from rainstereo.patch import LONGEST, Patch
 from rainstereo.trace import BLOCK, clear_transmittance, trace
 from rainstereo.types import Array, Image, Indices, Mask, Status
 
@@ -35,6 +35,8 @@ from .samples import Samples
 RAYS = 2  # along a pixel's side, to begin with
 CHUNK = 4096  # pixels traced at a time with all their rays
 TOGETHER = 1 << 16  # pixels that are held at a time
+OUTLINE = 2
+"""Times as many rays along a side at the outline of a drop, for plans that last."""
 CLEAR_STEP = 8
 LARGE = 1 << 22  # taps of a table that lasts
 NOTHING, DARK, LIT = 0, 1, 2  # of a pixel
@@ -42,9 +44,9 @@ EXTENTS = ((0.75, 33), (2.5, 17), (6.0, 9), (60.0, 5), (math.inf, 3))
 """Texels that a pixel may span, up to a tolerance."""
 WORTH = 0.003
 """Of a texel that is saved, in square gray levels, at a tolerance of 1 gray level; as its square. With this, drops are
-within the tolerance of 64 rays a pixel, which are themselves wrong by 0.6 to 0.8 gray levels, and of 576."""
-EACH = 0.07
-"""The same of a texel more in `Pursuit`."""
+within the tolerance of 64 rays a pixel, which are themselves wrong by 0.6 to 0.8 gray levels, and of 1024."""
+FINER_WORTH, EACH = 0.008, 0.22
+"""The same in plans that last, and of a texel more in `Pursuit`: within the tolerance of 1024 rays a pixel."""
 DEAREST = 4.0
 STRICT = 0.9
 """Gray levels: for tolerances below, there is only the tree, whose windows are finer."""
@@ -152,12 +154,12 @@ class Minifier:
         pixels = np.concatenate([batch.pixels for batch in batches])
         edges, outlines = (np.split(found, ends) for found in self.edges(pixels, np.concatenate(kinds)))
         for batch, kind, edge, outline in zip(batches, kinds, edges, outlines, strict=True):
-            fine = edge if self.lasting else outline
-            for some, along, together in ((~fine & (edge | (kind == LIT)), side, CHUNK), (fine, 2 * side, CHUNK // 4)):
+            fine = outline & self.lasting
+            for some, more in ((~fine & (edge | (kind == LIT)), 1), (fine, OUTLINE)):
                 rows = np.flatnonzero(some)
-                for first in range(0, len(rows), together):
-                    part = rows[first : first + together]
-                    yield self._look(batch, part, self.traced(batch, along, part))
+                for first in range(0, len(rows), CHUNK // more**2):
+                    part = rows[first : first + CHUNK // more**2]
+                    yield self._look(batch, part, self.traced(batch, more * side, part))
             dark = np.flatnonzero(~edge & (kind == DARK))
             yield self._look(batch, dark, _darkness(len(dark)))
 
@@ -221,17 +223,18 @@ class Minifier:
             with np.errstate(invalid="ignore", divide="ignore"):
                 displacement.append(np.where(number > 0, total / number, np.nan) - own)
             at = looked + np.float32(self.shift[axis])
-            last = self.source_size[axis] - 1
-            unknown |= (((at < 0) | (at > last)) & lit).any(0)
-            places.append(folded_along(at, last, self.border))
+            unknown |= (((at < 0) | (at > self.source_size[axis] - 1)) & lit).any(0)
+            places.append(at)
         taps = self._sums.taps(places[0], places[1], samples.gain * np.float32(1 / rays))
         return Lookups.of(pixels, batch.groups[rows], taps, 1 - covered / rays, np.stack(displacement, -1), unknown)
 
     @cached_property
     def _sums(self) -> Pursuit | Quadtree:
         extent = next(extent for tolerance, extent in EXTENTS if self.tolerance <= tolerance)
-        tree = Quadtree(self.source_size, extent, min(WORTH * self.tolerance**2, DEAREST))
-        if not self.lasting or not STRICT <= self.tolerance < math.inf:
+        pursued = self.lasting and STRICT <= self.tolerance < math.inf
+        worth = FINER_WORTH if pursued else WORTH
+        tree = Quadtree(self.source_size, extent, min(worth * self.tolerance**2, DEAREST), self.border)
+        if not pursued:
             return tree
         return Pursuit(self.source_size, min(EACH * self.tolerance**2, DEAREST), tree)
 
