@@ -176,7 +176,7 @@ def test_plans_that_last_are_within_a_gray_level_of_many_rays():
     found, other = plan.render(image), default.render(image)
     whole = np.minimum(found.opacity, other.opacity) == 1
     whole = cv2.erode(whole.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-    assert np.count_nonzero(whole) > 10_000
+    assert np.count_nonzero(whole) > 1000
     for name in ("displacement", "unknown"):  # by the same rays, but at outlines
         np.testing.assert_array_equal(getattr(found, name)[whole], getattr(other, name)[whole])
     rows, columns = np.nonzero((other.opacity > 0) & (other.opacity < 1))
