@@ -20,6 +20,7 @@ from rainstereo import compiled
 from rainstereo.types import Array, Indices, Mask
 
 from .quadtree import Taps
+from .windows import Column, WindowTaps
 
 JOINED = 1 << 20  # taps up to which tables are joined: both stand in memory meanwhile
 ROWS = 1 << 14  # that are moved at a time
@@ -32,7 +33,8 @@ class Lookups:
     """Pixels and their taps.
 
     pixels: (M,) int32 numbers of pixels, row by row. groups: (M,) int32, of the drops that were traced together.
-    counts: (M,) int32 of taps. texels: (T,) int32, `pyramid.copy_starts`. weights: (T,) int16, in 1/`UNIT`.
+    counts: (M,) int32 of taps. texels: (T,) int32, `pyramid.copy_starts`. weights: (T,) int16, in 1/`UNIT`; both are
+    arrays, or, in half the memory, the columns of `windows` that give them slice by slice.
     clear: (M,) float32. displacement: (M, 2) float32, pixels, from the pixel to the mean of what it looks at; NaN where
     it is dark. unknown: (M,) whether a ray falls beyond the image that holds the scene.
     """
@@ -75,6 +77,19 @@ class Lookups:
         keep = np.isin(self.groups, groups)
         if keep.all():
             return self
+        kept = self.of_rows(keep)
+        return kept.narrow(self.texels.taps.size)[0] if isinstance(self.texels, Column) else kept
+
+    def narrow(self, size: tuple[int, int]) -> tuple[Lookups, Lookups]:
+        """The rows whose taps fit into windows, held so, and the others. size: (width, height) of the scene's image."""
+        if isinstance(self.texels, Column):
+            return self, self.of_rows(np.zeros(len(self.pixels), dtype=np.bool_))
+        taps, fits = WindowTaps.of(size, self.counts, self.texels, self.weights)
+        held = {name: a if fits.all() else a[fits] for name, a in self.columns() if name not in OF_TAPS}
+        return Lookups(texels=Column(taps, "texels"), weights=Column(taps, "weights"), **held), self.of_rows(~fits)
+
+    def of_rows(self, keep: Mask) -> Lookups:
+        """Some of the rows."""
         taps = np.repeat(keep, self.counts)
         return Lookups(*(a[taps] if name in OF_TAPS else a[keep] for name, a in self.columns()))
 

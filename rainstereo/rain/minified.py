@@ -33,6 +33,7 @@ from .samples import Samples
 RAYS = 2  # along a pixel's side, to begin with
 CHUNK = 4096  # pixels traced at a time with all their rays
 TOGETHER = 1 << 16  # pixels that are held at a time
+MANY = 1 << 17  # pixels of a plan whose loops are compiled before its tables take memory
 CLEAR_STEP = 8
 LARGE = 1 << 22  # taps of a table that lasts
 NOTHING, DARK, LIT = 0, 1, 2  # of a pixel
@@ -108,18 +109,35 @@ class Minifier:
         """What every pixel of the batches that a drop covers looks at."""
         tables: list[Lookups] = []
         small: list[Lookups] = []
+        wide: list[Lookups] = []
         taps = every = 0
+        if sum(len(batch.pixels) for batch in batches) > MANY:
+            from .compile_ahead import compile_ahead  # which needs `paste`
+
+            compile_ahead()
         for table in self._one_by_one(batches):
             every += len(table.texels)
             if taps + len(table.texels) > self._joined:  # before the next ones come: the memory of these serves them
                 tables += self._ordered(small)
                 taps = 0
+                if every > LARGE:
+                    self._narrow(tables, wide)
+                    give_back()
             small.append(table)
             taps += len(table.texels)
         tables += self._ordered(small)
         if every > LARGE:
+            self._narrow(tables, wide)
+            tables += self._ordered(wide)
             give_back()
         return tables
+
+    def _narrow(self, tables: list[Lookups], wide: list[Lookups]) -> None:
+        """Hold tables in less memory; the rows that cannot be held so come to the others."""
+        for i, table in enumerate(tables):
+            tables[i], rest = table.narrow(self.source_size)
+            if len(rest.pixels):
+                wide.append(rest)
 
     def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
         return [table.ordered(self.camera.width) for table in Lookups.joined(tables, self._joined)]
