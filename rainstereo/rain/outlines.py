@@ -40,10 +40,9 @@ class Outlines:
     def of(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> Outlines:
         """The circles of drops, as a pinhole at the camera's centre sees them."""
         nowhere = np.zeros(0)
-        parts = [cls(nowhere, nowhere, nowhere, camera.size)]
-        for first in range(0, len(drops), BLOCK):
-            parts.append(cls._of_some(drops[first : first + BLOCK], camera, chamber))
-        return cls.joined(parts)
+        blocks = (drops[first : first + BLOCK] for first in range(0, len(drops), BLOCK))
+        parts = [cls._of_some(some, camera, chamber) for some in blocks]
+        return cls.joined([cls(nowhere, nowhere, nowhere, camera.size), *parts])
 
     @classmethod
     def _of_some(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> Outlines:

@@ -62,16 +62,19 @@ class WindowTaps:
         finest = _least(level, counts)
         left, top = (_least(at << level, counts) >> finest & -ALIGNED for at in (column, row))
         above = level - np.repeat(finest, counts)
-        along, down = (
-            at - (np.repeat(corner, counts) >> above) for at, corner in ((column, left), (row, top))
-        )
+        along, down = (at - (np.repeat(corner, counts) >> above) for at, corner in ((column, left), (row, top)))
         weight = weights.astype(np.int32) + MOST
         good = (texels < first[-1]) & (above < LEVELS) & (along < SIDE) & (down < SIDE)
         fits = _least(good & (weight >= 0) & (weight < 2 * MOST), counts, True)
         taps = np.repeat(fits, counts)
         codes = (((above << AXIS) | down) << AXIS) | along | ((weight >> 8) << PLACE)
         corners = first[finest] + top * wide[finest] + left
-        found = (corners[fits].astype(np.int32), counts[fits], codes[taps].astype(np.uint16), weight[taps].astype(np.uint8))
+        found = [
+            values.astype(kind)
+            for values, kind in (
+                (corners[fits], np.int32), (counts[fits], np.int32), (codes[taps], np.uint16), (weight[taps], np.uint8),
+            )
+        ]  # fmt: skip
         return cls(size, *found), fits
 
     def texels(self, first: int, last: int) -> Any:

@@ -1,0 +1,160 @@
+"""Taps held by their places in windows: the same numbers again, and frames; which pixels circles cover together."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rainstereo import Camera, Chamber, Panel, compiled
+from rainstereo.droplet import SphericalCap
+from rainstereo.rain import minified, outlines, paste
+from rainstereo.rain.compile_ahead import compile_ahead
+from rainstereo.rain.drops import Drops
+from rainstereo.rain.outlines import Outlines
+from rainstereo.rain.pyramid import sizes, starts
+from rainstereo.rain.render import Renderer
+from rainstereo.rain.windows import MOST, Column, WindowTaps
+
+SIZE = (203, 151)
+PANE = Chamber((0, 0, 1), 0.057, (Panel(0.003, 1.49),))
+needs_numba = pytest.mark.skipif(not compiled.available(), reason="numba is not installed")
+
+
+@pytest.fixture(params=["compiled", "numpy"])
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if request.param == "numpy":
+        monkeypatch.setattr(compiled, "available", lambda: False)
+    elif not compiled.available():
+        pytest.skip("numba is not installed")
+
+
+def taps(rng: np.random.Generator, size: tuple[int, int], rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Counts, texels and weights of rows that mostly look at one place on a few levels, but some anywhere."""
+    first, levels = starts(size), sizes(size)
+    counts, texels, weights = [], [], []
+    for row in range(rows):
+        count = int(rng.integers(0, 40)) * int(rng.random() < 0.9)
+        finest, spread = int(rng.integers(len(levels))), 1000 if row % 9 == 0 else 20
+        at = rng.integers(0, [levels[finest][0], levels[finest][1]])
+        for _ in range(count):
+            level = min(finest + int(rng.integers(6 if row % 7 == 0 else 4)), len(levels) - 1)
+            x, y = (at >> (level - finest)) + rng.integers(0, spread >> (level - finest), 2, endpoint=True)
+            wide, high = levels[level]
+            texels.append(first[level] + min(int(y), high - 1) * wide + min(int(x), wide - 1))
+            weights.append(int(rng.integers(-460, 1500)) if row % 5 else int(rng.integers(-3000, 3000)))
+        counts.append(count)
+    return np.array(counts, np.int32), np.array(texels, np.int32), np.array(weights, np.int16)
+
+
+@pytest.mark.usefixtures("way")
+@pytest.mark.parametrize("size", [SIZE, (1280, 960), (64, 48), (5, 4)])
+def test_taps_come_back_as_they_were(size, monkeypatch):
+    monkeypatch.setattr("rainstereo.rain.windows.ROWS", 50)
+    rng = np.random.default_rng(1)
+    counts, texels, weights = taps(rng, size, 330)
+    found, fits = WindowTaps.of(size, counts, texels, weights)
+    some = np.repeat(fits, counts)
+    assert 0.3 < fits.mean() < 1
+    for row, (good, end) in enumerate(zip(fits, np.cumsum(counts), strict=True)):  # what is refused has a reason
+        own = slice(end - counts[row], end)
+        level = np.searchsorted(starts(size), texels[own], "right") - 1
+        if not good and (np.abs(weights[own]) < MOST).all() and np.ptp(level) < 4:
+            assert np.ptp(texels[own] - np.array(starts(size))[level]) > 8  # it is wide
+    of_texels, of_weights = Column(found, "texels"), Column(found, "weights")
+    np.testing.assert_array_equal(of_texels, texels[some])
+    np.testing.assert_array_equal(of_weights, weights[some])
+    assert (of_texels[:].dtype, of_weights[:].dtype) == (np.int32, np.int16)
+    for first, last in np.sort(rng.integers(0, len(of_texels) + 1, (60, 2)), axis=1).tolist():
+        np.testing.assert_array_equal(of_texels[first:last], texels[some][first:last])
+        np.testing.assert_array_equal(of_weights[first:last], weights[some][first:last])
+    assert len(of_texels) == np.count_nonzero(some)
+
+
+def test_no_taps_at_all():
+    for counts in (np.zeros(0, np.int32), np.zeros(3, np.int32)):
+        found, fits = WindowTaps.of(SIZE, counts, np.zeros(0, np.int32), np.zeros(0, np.int16))
+        assert fits.all()
+        assert len(fits) == len(counts)
+        assert len(Column(found, "texels")[:]) == len(Column(found, "weights")[:]) == 0
+
+
+@pytest.mark.usefixtures("way")
+@pytest.mark.parametrize("depth", [np.uint8, np.float32])
+def test_frames_are_the_same(depth, monkeypatch):
+    """A plan that is held in windows, drawn in parts or not, gives the frame of one that is not, bit for bit."""
+    camera = Camera.pinhole(400, 400, 101, 75, *SIZE)
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(-0.015, 0.015, 60), rng.uniform(-0.011, 0.011, 60)
+    drops = Drops(x, y, rng.uniform(2e-4, 9e-4, 60), rng.uniform(0.3, 1.2, 60))
+    image = rng.integers(0, 256, (*SIZE[::-1], 3)).astype(depth)
+    wide = Renderer(camera, PANE).plan(drops)
+    assert not any(isinstance(table.texels, Column) for table in wide.tables)
+    monkeypatch.setattr(minified, "LARGE", 1000)
+    monkeypatch.setattr(minified, "JOINED", 50_000)
+    narrow = Renderer(camera, PANE).plan(drops)
+    held = [table for table in narrow.tables if isinstance(table.texels, Column)]
+    bits = 8 * sum(table.texels.taps.codes.nbytes + table.texels.taps.low.nbytes for table in held)
+    assert bits == 24 * sum(len(table.texels) for table in held) > 0
+    assert sum(len(table.pixels) for table in held) > 0.9 * sum(len(table.pixels) for table in narrow.tables)
+    expected = wide.apply(image)
+    for kept in (paste.KEPT, 100):
+        monkeypatch.setattr(paste, "KEPT", kept)
+        np.testing.assert_array_equal(dataclasses.replace(narrow).apply(image), expected)
+    for name in ("opacity", "displacement", "unknown"):
+        np.testing.assert_array_equal(getattr(narrow, name), getattr(wide, name))
+
+
+def test_groups_of_a_plan_in_windows(monkeypatch):
+    """A sequence that keeps drops of such a plan, and loses others, draws what a plan of the rest draws."""
+    monkeypatch.setattr(minified, "LARGE", 0)
+    renderer = Renderer(Camera.pinhole(400, 400, 101, 75, *SIZE), PANE)
+    caps = [SphericalCap((x / 1000, y / 1000), 1.2e-3, 0.9) for x in (-9, -4, 1, 6) for y in (-4, 4)]
+    image = np.random.default_rng(3).integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
+    frames = renderer.sequence()
+    assert any(isinstance(table.texels, Column) for table in frames.plan(caps).tables)
+    left = frames.plan(caps[1:7])
+    assert all(isinstance(table.texels, Column) for table in left.tables)
+    np.testing.assert_array_equal(left.apply(image), renderer.plan(caps[1:7]).apply(image))
+
+
+@needs_numba
+def test_loops_compiled_ahead_are_those_that_draw(monkeypatch):
+    """A plan that comes after has nothing left to compile."""
+    from rainstereo.compiled import orders, sums, windows, words
+
+    loops = [orders.reorder, sums.interleave, sums.sum_words, windows.places]
+    loops += [words.pack, words.pack_some, words.average]
+    compile_ahead.cache_clear()
+    compile_ahead()
+    before = [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
+    monkeypatch.setattr(minified, "LARGE", 1000)
+    camera = Camera.pinhole(400, 400, 101, 75, *SIZE)
+    plan = Renderer(camera, PANE).plan([SphericalCap((0.0, 0.0), 4e-3, 0.9), SphericalCap((9e-3, 0.0), 1e-3, 0.9)])
+    plan.apply(np.zeros((*SIZE[::-1], 3), dtype=np.uint8))
+    assert [len(loop.signatures) for loop in loops] == before  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("count", [1, 7, 90, 400])
+def test_pixels_of_circles_that_overlap(count, monkeypatch):
+    """Each once, with the label of its chain, as from a list of all circles' pixels; also block by block."""
+    rng = np.random.default_rng(count)
+    radius = np.where(rng.random(count) < 0.1, 0, rng.uniform(1, 400 / np.sqrt(count), count))
+    radius[0] = np.inf if count == 7 else radius[0]
+    circles = Outlines(rng.uniform(-20, 223, count), rng.uniform(-20, 171, count), radius, SIZE)
+    labels = np.zeros(count, np.intp)
+    for number, rows in enumerate(circles.groups()):
+        labels[rows] = 3 * number + 5
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+    expected: np.ndarray = np.full(SIZE[::-1], -1)
+    for i in range(count):
+        if radius[i] > 0:
+            expected[(x - circles.x[i]) ** 2 + (y - circles.y[i]) ** 2 <= radius[i] ** 2] = labels[i]
+    for block in (outlines.BLOCK, 13):
+        monkeypatch.setattr(outlines, "BLOCK", block)
+        again = np.zeros(count, np.intp)
+        for number, rows in enumerate(circles.groups()):
+            again[rows] = 3 * number + 5
+        np.testing.assert_array_equal(again, labels)
+        pixels, found = circles.united(labels)
+        np.testing.assert_array_equal(pixels, np.flatnonzero(expected >= 0))
+        np.testing.assert_array_equal(found, expected.ravel()[pixels])
