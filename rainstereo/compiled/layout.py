@@ -11,5 +11,4 @@ QUARTERS, COLUMNS, ROWS = 0, 1, 2
 """How a copy of an image is made of another: means over 2 x 2 texels, over pairs of columns, over pairs of rows."""
 DRAW, COUNT, FILL = 0, 1, 2
 """What the loops over caps do: draw a frame, count its pixels and taps, or write them down."""
-AXIS, PLACE = 5, 12
-"""Bits of a texel's place in a window along an axis, and in all: level, row, column (`rain.windows`)."""
+PLACE = 10  # bits of a texel's place in a window (`rain.windows`)

@@ -20,9 +20,10 @@ from rainstereo import compiled
 from rainstereo.types import Array, Indices, Mask
 
 from .quadtree import Taps
-from .windows import Column, WindowTaps
+from .windows import Column, PairTaps, WindowTaps
 
 JOINED = 1 << 20  # taps up to which tables are joined: both stand in memory meanwhile
+ROW = 8  # taps that the rest of a row is as dear as
 ROWS = 1 << 14  # that are moved at a time
 TILE = 64  # pixels of the scene
 BITS = 10  # of the number of a tile, along an axis
@@ -58,17 +59,22 @@ class Lookups:
             clear.astype(np.float32), displacement.astype(np.float32), unknown,
         )  # fmt: skip
 
+    @property
+    def size(self) -> int:
+        """How much it takes to hold and to order the table, in taps."""
+        return len(self.texels) + ROW * len(self.pixels)
+
     @classmethod
     def joined(cls, parts: list[Lookups], most: int = JOINED) -> list[Lookups]:
-        """The same in few tables, of so many taps at most; empties the list, to spare memory."""
+        """The same in few tables of such a `size` at most; empties the list, to spare memory."""
         tables: list[Lookups] = []
         parts.reverse()
         while parts:
             same = [parts.pop()]
-            taps = len(same[0].texels)
-            while parts and taps + len(parts[-1].texels) <= most:
+            size = same[0].size
+            while parts and size + parts[-1].size <= most:
                 same.append(parts.pop())
-                taps += len(same[-1].texels)
+                size += same[-1].size
             tables.append(same[0] if len(same) == 1 else _joined(same))
         return tables
 
@@ -77,8 +83,10 @@ class Lookups:
         keep = np.isin(self.groups, groups)
         if keep.all():
             return self
-        kept = self.of_rows(keep)
-        return kept.narrow(self.texels.taps.size)[0] if isinstance(self.texels, Column) else kept
+        kept, held = self.of_rows(keep), getattr(self.texels, "taps", None)
+        if isinstance(held, WindowTaps):
+            return kept.narrow(held.size)[0]
+        return kept if held is None else kept.paired()
 
     def narrow(self, size: tuple[int, int]) -> tuple[Lookups, Lookups]:
         """The rows whose taps fit into windows, held so, and the others. size: (width, height) of the scene's image."""
@@ -86,7 +94,13 @@ class Lookups:
             return self, self.of_rows(np.zeros(len(self.pixels), dtype=np.bool_))
         taps, fits = WindowTaps.of(size, self.counts, self.texels, self.weights)
         held = {name: a if fits.all() else a[fits] for name, a in self.columns() if name not in OF_TAPS}
-        return Lookups(texels=Column(taps, "texels"), weights=Column(taps, "weights"), **held), self.of_rows(~fits)
+        held |= {name: Column(taps, name) for name in OF_TAPS}
+        return Lookups(**held | {"counts": taps.counts}), self.of_rows(~fits)
+
+    def paired(self) -> Lookups:
+        """The same, each texel and its weight in one number, if they fit."""
+        taps = None if isinstance(self.texels, Column) else PairTaps.of(self.texels, self.weights)
+        return self if taps is None else replace(self, **{name: Column(taps, name) for name in OF_TAPS})
 
     def of_rows(self, keep: Mask) -> Lookups:
         """Some of the rows."""

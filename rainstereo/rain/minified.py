@@ -110,34 +110,37 @@ class Minifier:
         tables: list[Lookups] = []
         small: list[Lookups] = []
         wide: list[Lookups] = []
-        taps = every = 0
+        size = every = 0
         if sum(len(batch.pixels) for batch in batches) > MANY:
             from .compile_ahead import compile_ahead  # which needs `paste`
 
             compile_ahead()
         for table in self._one_by_one(batches):
             every += len(table.texels)
-            if taps + len(table.texels) > self._joined:  # before the next ones come: the memory of these serves them
+            if size + table.size > self._joined:  # before the next ones come: the memory of these serves them
                 tables += self._ordered(small)
-                taps = 0
+                size = 0
                 if every > LARGE:
                     self._narrow(tables, wide)
                     give_back()
             small.append(table)
-            taps += len(table.texels)
+            size += table.size
         tables += self._ordered(small)
         if every > LARGE:
             self._narrow(tables, wide)
-            tables += self._ordered(wide)
+            tables += [table.paired() for table in self._ordered(wide)]
             give_back()
         return tables
 
     def _narrow(self, tables: list[Lookups], wide: list[Lookups]) -> None:
-        """Hold tables in less memory; the rows that cannot be held so come to the others."""
+        """Hold tables in less memory. wide: what takes more, and is waiting until it is many."""
         for i, table in enumerate(tables):
             tables[i], rest = table.narrow(self.source_size)
             if len(rest.pixels):
                 wide.append(rest)
+        if sum(table.size for table in wide) > self._joined:
+            tables += [table.paired() for table in self._ordered(wide)]
+            wide.clear()
 
     def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
         return [table.ordered(self.camera.width) for table in Lookups.joined(tables, self._joined)]
@@ -172,7 +175,9 @@ class Minifier:
                 part = rows[first : first + CHUNK]
                 yield self._look(batch, part, self.traced(batch, side, part))
             dark = np.flatnonzero(~edge & (kind == DARK))
-            yield self._look(batch, dark, _darkness(len(dark)))
+            for first in range(0, len(dark), TOGETHER):
+                part = dark[first : first + TOGETHER]
+                yield self._look(batch, part, _darkness(len(part)))
 
     # -- tracing -------------------------------------------------------------------------------------------------------
 
