@@ -12,9 +12,9 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 
-from rainstereo import compiled
 from rainstereo.compiled.layout import COLUMNS, QUARTERS, ROWS
 from rainstereo.types import Image, Mask
 
@@ -94,18 +94,22 @@ class Texels:
         return [each.reshape(-1, each.shape[-1]) for each in found]
 
     def put_words(self, levels: list[Image], part: slice, row: Any) -> None:
-        """Write words of up to three channels of bytes, (n,)."""
-        if not compiled.available():
-            self._put(levels, part, row, words.packed, words.mean)
-            return
-        from rainstereo.compiled.words import average, pack, pack_some
+        """Write words of up to three channels of bytes, (n,) uint64."""
+        self._put(levels, part, row, words.packed, words.mean)
 
-        channels = part.stop - part.start
+    def put_quads(self, levels: list[Image], row: Any) -> None:
+        """Write quads of up to four channels of bytes, (n,) uint32, in compiled loops."""
+        from rainstereo.compiled.quads import average, pack, pack_some
+
         if self.whole:
-            pack(levels[-1], part.start, channels, row[: len(levels[-1])])
+            base, quads = levels[-1], row[: len(levels[-1])]
+            if base.shape[1] == 3:
+                cv2.cvtColor(base[None], cv2.COLOR_BGR2BGRA, dst=quads.view(np.uint8).reshape(1, -1, 4))
+            else:
+                pack(base, quads)
             average(row, self.made)
         for level, rows, (a, b) in zip(levels, self.picked, pairwise(self.ends), strict=False):
-            pack_some(level, part.start, channels, rows, row[a:b])
+            pack_some(level, rows, row[a:b])
 
     def put_numbers(self, levels: list[Image], row: Image) -> None:
         """Write values, (n, C) float32."""

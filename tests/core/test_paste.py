@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rainstereo import Camera, Chamber, Panel, compiled
+from rainstereo.compiled.layout import SHORT_BITS
 from rainstereo.droplet import SphericalCap
 from rainstereo.rain import paste, words
 from rainstereo.rain.lookups import Lookups
@@ -45,7 +46,7 @@ def drawn(plan: Plan, image: np.ndarray) -> np.ndarray:
 
 
 @needs_numba
-@pytest.mark.parametrize("limits", [{}, {"KEPT": 100, "ROWS": 97}, {"SHORT": 8}], ids=["kept", "in parts", "64 bits"])
+@pytest.mark.parametrize("limits", [{}, {"KEPT": 100, "ROWS": 97}, {"SHORT": 256}], ids=["kept", "in parts", "64 bits"])
 @pytest.mark.parametrize("channels", [0, 1, 2, 3, 4])
 def test_compiled_as_not(plan, channels, limits, monkeypatch):
     """Bit for bit, whether places are kept or found anew, in 32 bits or 64."""
@@ -213,5 +214,5 @@ def test_words_are_clipped_field_by_field():
 
 def test_weights_and_places_fit_into_a_tap():
     """12 bits hold the weight of a texel, below 0, too; a word's field the sums that weights allow."""
-    assert 2 * UNIT <= 1 << (32 - paste.SHORT - 1)
+    assert 2 * UNIT <= 1 << (32 - SHORT_BITS - 1)
     assert (words.BELOW + 384) * UNIT <= 1 << words.FIELD

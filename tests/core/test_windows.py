@@ -135,10 +135,10 @@ def test_groups_of_a_plan_in_windows(monkeypatch):
 @needs_numba
 def test_loops_compiled_ahead_are_those_that_draw(monkeypatch):
     """A plan that comes after has nothing left to compile."""
-    from rainstereo.compiled import orders, sums, windows, words
+    from rainstereo.compiled import orders, quads, sums, windows
 
-    loops = [orders.reorder, sums.interleave, sums.sum_words, windows.places]
-    loops += [words.pack, words.pack_some, words.average]
+    loops = [orders.reorder, sums.interleave, sums.lines, sums.sum_quads, windows.places]
+    loops += [quads.pack, quads.pack_some, quads.average]
     compile_ahead.cache_clear()
     compile_ahead()
     before = [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
