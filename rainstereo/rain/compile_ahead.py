@@ -12,15 +12,25 @@ from rainstereo.compiled.layout import LONG_BITS, SHORT_BITS
 from .free_memory import give_back
 from .lookups import Lookups
 from .paste import Paste
+from .pursuit import Pursuit
+from .quadtree import Quadtree
 
 SIDE = 8  # pixels
+SPAN = 40  # of the rays of a pixel
+
+
+def compile_ahead(sums: Pursuit | Quadtree) -> None:
+    """Find the taps of one pixel, order, pack and draw them; nothing without numba."""
+    if compiled.available():
+        along = np.linspace(0, SPAN, SIDE, dtype=np.float32)
+        x, y = (at.reshape(-1, 1) for at in np.meshgrid(along, along))
+        sums.taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
+        _draw()
+        give_back()
 
 
 @cache
-def compile_ahead() -> None:
-    """Order, pack and draw a table of one pixel; nothing without numba."""
-    if not compiled.available():
-        return
+def _draw() -> None:
     texels, weights = np.arange(4, dtype=np.int32), np.full(4, 256, dtype=np.int16)
     one, clear = np.zeros(1, dtype=np.int32), np.zeros(1, dtype=np.float32)
     nowhere, unknown = np.zeros((1, 2), dtype=np.float32), np.zeros(1, dtype=np.bool_)
@@ -31,4 +41,3 @@ def compile_ahead() -> None:
             paste = Paste([some], (SIDE, SIDE))
             paste.__dict__["_of_tap"] = of_tap  # as of an image of so many texels
             paste.paste(image, image, image.copy())
-    give_back()

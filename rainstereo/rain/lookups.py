@@ -10,7 +10,6 @@ summed (`paste`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -143,8 +142,11 @@ class Lookups:
 OF_TAPS = ("texels", "weights")
 
 
-def _joined(same: Sequence[Lookups]) -> Lookups:
-    return Lookups(*(np.concatenate([getattr(part, name) for part in same]) for name, _ in same[0].columns()))
+def _joined(same: list[Lookups]) -> Lookups:
+    """One table of several; empties the list, so that each column is there twice only while it is copied."""
+    columns = {f.name: [getattr(part, f.name) for part in same] for f in fields(Lookups)}
+    same.clear()
+    return Lookups(**{name: np.concatenate(columns.pop(name)) for name in list(columns)})
 
 
 def _along_curve(column: Indices, row: Indices) -> Indices:

@@ -114,7 +114,7 @@ class Minifier:
         if sum(len(batch.pixels) for batch in batches) > MANY:
             from .compile_ahead import compile_ahead  # which needs `paste`
 
-            compile_ahead()
+            compile_ahead(self._sums)
         for table in self._one_by_one(batches):
             every += len(table.texels)
             if size + table.size > self._joined:  # before the next ones come: the memory of these serves them
@@ -135,6 +135,9 @@ class Minifier:
     def _narrow(self, tables: list[Lookups], wide: list[Lookups]) -> None:
         """Hold tables in less memory. wide: what takes more, and is waiting until it is many."""
         for i, table in enumerate(tables):
+            if self.lasting:  # with texels and weights that windows do not have
+                tables[i] = table.paired()
+                continue
             tables[i], rest = table.narrow(self.source_size)
             if len(rest.pixels):
                 wide.append(rest)

@@ -25,6 +25,7 @@ ALIGNED = 1 << (LEVELS - 1)  # windows begin at multiples of this, so that those
 SIDE = 3 * ALIGNED  # as wide as those of `quadtree` at tolerances from 0.75 on
 OTHER = (1 << (16 - PLACE)) - 1  # in place of weights that are not below it, or not above 0
 ROWS = 1 << 12  # that are packed at a time
+MOST_BITS = 31  # of a texel's number
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,22 +91,22 @@ class WindowTaps:
         ends = np.cumsum(self.counts, dtype=np.int64)
         a, b = np.searchsorted(ends, [first, last - 1], "right").tolist()
         rows, skipped = slice(a, b + 1), first - int(ends[a] - self.counts[a])
+        found: Any = np.empty(last - first, dtype=np.int32)
+        counts, codes = self.counts[rows].copy(), self.codes[first:last]
+        counts[0] -= skipped
+        counts[-1] -= int(counts.sum()) - len(found)
         starts, wide = _levels(self.size)
+        above_of, offsets = _offsets(self.size)
+        if compiled.available():
+            from rainstereo.compiled.windows import places
+
+            places(self.corners[rows], starts, wide, above_of, offsets, counts, codes, found)
+            return found
         level = np.searchsorted(starts[1:-1], self.corners[rows], "right")
         row, column = np.divmod(self.corners[rows] - starts[level], wide[level])
         above = np.arange(LEVELS)
         there = np.minimum(level[:, None] + above, len(wide) - 1)
         corners = starts[there] + (row[:, None] >> above) * wide[there] + (column[:, None] >> above)
-        found: Any = np.empty(last - first, dtype=np.int32)
-        counts, codes = self.counts[rows].copy(), self.codes[first:last]
-        counts[0] -= skipped
-        counts[-1] -= int(counts.sum()) - len(found)
-        above_of, offsets = _offsets(self.size)
-        if compiled.available():
-            from rainstereo.compiled.windows import places
-
-            places(corners, level, above_of, offsets, counts, codes, found)
-            return found
         place = codes & np.uint16((1 << PLACE) - 1)
         which = np.repeat(np.arange(len(counts)), counts)
         found[:] = offsets[level[which], place] + corners[which, above_of[place]]
@@ -124,21 +125,22 @@ class WindowTaps:
 
 @dataclass(frozen=True, eq=False)
 class PairTaps:
-    """Taps of any rows. pairs: (T,) uint32, texels in so many lowest bits, and weights above them."""
+    """Taps of any rows. pairs: (T,) uint32, texels in so many lowest bits, and above them weights, less the lowest."""
 
     bits: int
+    lowest: int
     pairs: Any
 
     @classmethod
     def of(cls, texels: Any, weights: Any) -> PairTaps | None:
         """None where that is not enough."""
-        bits = int(texels.max(initial=0)).bit_length()
-        if bits > 31 or (weights < 0).any() or weights.max(initial=0) >= 1 << (32 - bits):
+        bits, lowest = int(texels.max(initial=0)).bit_length(), int(weights.min(initial=0))
+        if bits > MOST_BITS or int(weights.max(initial=0)) - lowest >= 1 << (32 - bits):
             return None
-        pairs = weights.astype(np.uint32)
+        pairs = np.subtract(weights, lowest, dtype=np.int32).view(np.uint32)
         pairs <<= np.uint32(bits)
         pairs |= texels.view(np.uint32)
-        return cls(bits, pairs)
+        return cls(bits, lowest, pairs)
 
     def texels(self, first: int, last: int) -> Any:
         """Of taps from the first to before the last, int32."""
@@ -146,7 +148,9 @@ class PairTaps:
 
     def weights(self, first: int, last: int) -> Any:
         """The same, int16."""
-        return (self.pairs[first:last] >> np.uint32(self.bits)).astype(np.int16)
+        found = (self.pairs[first:last] >> np.uint32(self.bits)).astype(np.int16)
+        found += self.lowest
+        return found
 
     def __len__(self) -> int:
         return len(self.pairs)

@@ -71,16 +71,18 @@ def test_taps_come_back_as_they_were(size, monkeypatch):
     assert len(of_texels) == np.count_nonzero(some)
 
 
-def test_pairs_come_back_as_they_were():
+@pytest.mark.parametrize("lowest", [0, -460])
+def test_pairs_come_back_as_they_were(lowest):
     rng = np.random.default_rng(5)
-    texels, weights = rng.integers(0, 1_638_400, 999, np.int32), rng.integers(0, 2048, 999, np.int16)
+    texels, weights = rng.integers(0, 1_638_400, 999, np.int32), rng.integers(lowest, lowest + 2048, 999, np.int16)
     found = PairTaps.of(texels, weights)
     assert found is not None
     np.testing.assert_array_equal(Column(found, "texels"), texels)
     np.testing.assert_array_equal(Column(found, "weights")[7:90], weights[7:90])
-    assert Column(found, "texels")[:].dtype == np.int32
-    assert PairTaps.of(texels, weights - 1) is None
-    assert PairTaps.of(2 * texels, weights) is None
+    assert (Column(found, "texels")[:].dtype, Column(found, "weights")[:].dtype) == (np.int32, np.int16)
+    weights[3:5] = lowest, lowest + 2048
+    assert PairTaps.of(texels, weights) is None
+    assert PairTaps.of(2 * texels, weights - (weights == lowest + 2048)) is None
 
 
 def test_no_taps_at_all():
@@ -89,6 +91,19 @@ def test_no_taps_at_all():
         assert fits.all()
         assert len(fits) == len(counts)
         assert len(Column(found, "texels")[:]) == len(Column(found, "weights")[:]) == 0
+
+
+def test_plans_that_last_are_held_in_pairs(monkeypatch):
+    """Their weights may be below 0, and their texels oblong."""
+    camera = Camera.pinhole(400, 400, 101, 75, *SIZE)
+    image = np.random.default_rng(6).integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
+    drop = SphericalCap((0.001, 0.002), 8e-4, 0.8)
+    wide = Renderer(camera, PANE, lasting=True).plan(drop)
+    monkeypatch.setattr(minified, "LARGE", 1000)
+    held = Renderer(camera, PANE, lasting=True).plan(drop)
+    assert {type(table.texels.taps) for table in held.tables} == {PairTaps}
+    assert min(table.weights[:].min() for table in held.tables) < 0
+    np.testing.assert_array_equal(held.apply(image), wide.apply(image))
 
 
 @pytest.mark.usefixtures("way")
@@ -106,9 +121,7 @@ def test_frames_are_the_same(depth, monkeypatch):
     monkeypatch.setattr(minified, "JOINED", 50_000)
     narrow = Renderer(camera, PANE).plan(drops)
     held = [table for table in narrow.tables if isinstance(table.texels, Column)]
-    columns = [
-        getattr(t.texels.taps, name) for t in held for name in vars(t.texels.taps) if name not in ("size", "bits")
-    ]
+    columns = [each for table in held for each in vars(table.texels.taps).values() if isinstance(each, np.ndarray)]
     assert 0 < sum(column.nbytes for column in columns) < 3 * sum(len(table.texels) for table in narrow.tables)
     assert {type(table.texels.taps) for table in narrow.tables} == {WindowTaps, PairTaps}
     expected = wide.apply(image)
@@ -133,18 +146,19 @@ def test_groups_of_a_plan_in_windows(monkeypatch):
 
 
 @needs_numba
-def test_loops_compiled_ahead_are_those_that_draw(monkeypatch):
+@pytest.mark.parametrize("lasting", [False, True])
+def test_loops_compiled_ahead_are_those_that_draw(lasting, monkeypatch):
     """A plan that comes after has nothing left to compile."""
-    from rainstereo.compiled import orders, quads, sums, windows
+    from rainstereo.compiled import orders, pursuit, quads, sums, windows
 
-    loops = [orders.reorder, sums.interleave, sums.lines, sums.sum_quads, windows.places]
+    loops = [pursuit.choose] if lasting else []
+    loops += [orders.reorder, sums.interleave, sums.lines, sums.sum_quads, windows.places]
     loops += [quads.pack, quads.pack_some, quads.average]
-    compile_ahead.cache_clear()
-    compile_ahead()
+    renderer = Renderer(Camera.pinhole(400, 400, 101, 75, *SIZE), PANE, lasting=lasting)
+    compile_ahead(renderer._minifier._sums)
     before = [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
     monkeypatch.setattr(minified, "LARGE", 1000)
-    camera = Camera.pinhole(400, 400, 101, 75, *SIZE)
-    plan = Renderer(camera, PANE).plan([SphericalCap((0.0, 0.0), 4e-3, 0.9), SphericalCap((9e-3, 0.0), 1e-3, 0.9)])
+    plan = renderer.plan([SphericalCap((0.0, 0.0), 1e-3, 0.9), SphericalCap((3e-3, 0.0), 5e-4, 0.9)])
     plan.apply(np.zeros((*SIZE[::-1], 3), dtype=np.uint8))
     assert [len(loop.signatures) for loop in loops] == before  # type: ignore[attr-defined]
 
