@@ -93,6 +93,14 @@ class DefocusedPatch:
         colour[self._coarse_opacity == 0] = 0
         return Layer(*self._window, self._fine(colour), self._opacity)
 
+    @property
+    def opacity(self) -> tuple[slice, slice, Array]:
+        """Rows and columns of the image, and the opacity there: that of every layer, without its colours."""
+        if self.sharp or not self.patch.opacity.size:
+            layer = self.patch.layer(np.zeros(self.size[::-1], dtype=np.uint8), self.border)
+            return layer.rows, layer.columns, layer.opacity
+        return *self._window, self._opacity
+
     # -- the plan, made for the first frame ------------------------------------------------------------------------
 
     @cached_property

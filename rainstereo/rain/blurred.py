@@ -77,12 +77,10 @@ class BlurredLayer:
             outer.append(slice(first - part.start, end - part.start))
         return (inner[0], inner[1]), (outer[0], outer[1])
 
-    @cached_property
+    @property
     def opacity(self) -> tuple[slice, slice, Array]:
         """Rows and columns of the frame, and the opacity there."""
-        width, height = self.patch.size
-        layer = self.patch.layer(np.zeros((height, width), dtype=np.uint8))
-        return layer.rows, layer.columns, layer.opacity
+        return self.patch.opacity
 
     def _fine(self, values: Array) -> Array:
         """Values of the patch's samples at the pixels of the frame."""

@@ -188,7 +188,10 @@ def test_peak_opacity() -> None:
     image = np.zeros((960, 1280), np.uint8)
     for radius in (0.5e-3, 1e-3, 2e-3):
         drop = cap(30, radius=radius)
-        layer = defocused(drop, CAMERA, chamber_at(0.06), WIDE_OPEN).layer(image)
+        patch = defocused(drop, CAMERA, chamber_at(0.06), WIDE_OPEN)
+        layer, (rows, columns, opacity) = patch.layer(image), patch.opacity
+        assert (rows, columns) == (layer.rows, layer.columns)
+        np.testing.assert_array_equal(opacity, layer.opacity)
         share = min(1, (radius / WIDE_OPEN.aperture) ** 2)
         assert 0.99 * share <= layer.opacity.max() <= 1.09 * share  # a smaller disc, for its softer edge, is denser
 
