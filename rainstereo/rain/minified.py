@@ -35,7 +35,7 @@ CHUNK = 4096  # pixels traced at a time with all their rays
 TOGETHER = 1 << 16  # pixels that are held at a time
 MANY = 1 << 17  # pixels of a plan whose loops are compiled before its tables take memory
 CLEAR_STEP = 8
-LARGE = 1 << 22  # taps of a table that lasts
+LARGE = 1 << 22  # taps of a plan beyond which they are held in less memory, for a little more time in each frame
 NOTHING, DARK, LIT = 0, 1, 2  # of a pixel
 EXTENTS = ((0.75, 33), (2.5, 17), (6.0, 9), (60.0, 5), (math.inf, 3))
 """Texels that a pixel may span, up to a tolerance."""
@@ -117,7 +117,7 @@ class Minifier:
             compile_ahead(self._sums)
         for table in self._one_by_one(batches):
             every += len(table.texels)
-            if size + table.size > self._joined:  # before the next ones come: the memory of these serves them
+            if size + table.size > JOINED:  # before the next ones come: the memory of these serves them
                 tables += self._ordered(small)
                 size = 0
                 if every > LARGE:
@@ -141,17 +141,12 @@ class Minifier:
             tables[i], rest = table.narrow(self.source_size)
             if len(rest.pixels):
                 wide.append(rest)
-        if sum(table.size for table in wide) > self._joined:
+        if sum(table.size for table in wide) > JOINED:
             tables += [table.paired() for table in self._ordered(wide)]
             wide.clear()
 
     def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
-        return [table.ordered(self.camera.width) for table in Lookups.joined(tables, self._joined)]
-
-    @property
-    def _joined(self) -> int:
-        """Taps up to which tables are joined: the more, the better their order serves the caches."""
-        return LARGE if self.lasting else JOINED
+        return [table.ordered(self.camera.width) for table in Lookups.joined(tables)]
 
     def _one_by_one(self, batches: Sequence[Batch]) -> Iterator[Lookups]:
         """Tables of a few thousand pixels each; none is empty."""
