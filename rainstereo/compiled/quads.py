@@ -12,7 +12,7 @@ from .layout import COLUMNS, QUARTERS, ROWS
 U, Q = np.uint64, np.uint32
 EVEN = Q(0x00FF00FF)
 """Every other byte: the rest of each 16 bits has room for sums."""
-HALF, QUARTER = Q(0x00010001), Q(0x00020002)  # what rounds means of two and of four: halves up
+EACH = Q(0x00010001)
 BYTE, ONE, TWO = Q(8), Q(1), Q(2)
 
 
@@ -44,31 +44,34 @@ def pack_some(values: Any, rows: Any, quads: Any) -> None:
 
 
 @inlined
-def mean_of_two(a: Any, b: Any) -> Any:
-    """Byte by byte, halves rounded up."""
-    low = (((a & EVEN) + (b & EVEN) + HALF) >> ONE) & EVEN
-    high = ((((a >> BYTE) & EVEN) + ((b >> BYTE) & EVEN) + HALF) >> ONE) & EVEN
+def mean_of_two(a: Any, b: Any, more: Any) -> Any:
+    """Byte by byte; more: what is added to each sum before it is cut off."""
+    low = (((a & EVEN) + (b & EVEN) + more) >> ONE) & EVEN
+    high = ((((a >> BYTE) & EVEN) + ((b >> BYTE) & EVEN) + more) >> ONE) & EVEN
     return low | (high << BYTE)
 
 
 @inlined
-def mean_of_four(a: Any, b: Any, c: Any, d: Any) -> Any:
+def mean_of_four(a: Any, b: Any, c: Any, d: Any, more: Any) -> Any:
     """The same of four."""
-    low = (((a & EVEN) + (b & EVEN) + (c & EVEN) + (d & EVEN) + QUARTER) >> TWO) & EVEN
+    low = (((a & EVEN) + (b & EVEN) + (c & EVEN) + (d & EVEN) + more) >> TWO) & EVEN
     high = ((a >> BYTE) & EVEN) + ((b >> BYTE) & EVEN) + ((c >> BYTE) & EVEN) + ((d >> BYTE) & EVEN)
-    return low | ((((high + QUARTER) >> TWO) & EVEN) << BYTE)
+    return low | ((((high + more) >> TWO) & EVEN) << BYTE)
 
 
 @compiled
 def average(quads: Any, copies: Any) -> None:
     """Make copies of others, in turn, all in `quads`, (N,).
 
-    copies: (n, 5) int64: how (`QUARTERS`, `COLUMNS`, `ROWS`), the place of the first texel of what a copy is made of,
-    its width and height, and the place of the copy's own first texel. An odd last column or row is its own pair.
+    copies: (n, 6) int64: how (`QUARTERS`, `COLUMNS`, `ROWS`), the place of the first texel of what a copy is made of,
+    its width and height, the place of the copy's own first texel, and whether halves are rounded up. An odd last column
+    or row is its own pair.
     """
     for each in range(U(len(copies))):
         how, width, height = copies[each, U(0)], U(copies[each, U(2)]), U(copies[each, U(3)])
         given, made = U(copies[each, U(1)]), U(copies[each, U(4)])
+        of_two = EACH if copies[each, U(5)] else Q(0)
+        of_four = of_two + EACH
         across = U(1) if how == ROWS else U(2)
         down = U(1) if how == COLUMNS else U(2)
         pairs = width // across
@@ -81,14 +84,14 @@ def average(quads: Any, copies: Any) -> None:
             if how == QUARTERS:
                 for j in range(pairs):
                     left, right = j + j, j + j + U(1)
-                    line[j] = mean_of_four(above[left], above[right], below[left], below[right])
+                    line[j] = mean_of_four(above[left], above[right], below[left], below[right], of_four)
             elif how == COLUMNS:
                 for j in range(pairs):
-                    line[j] = mean_of_two(above[j + j], above[j + j + U(1)])
+                    line[j] = mean_of_two(above[j + j], above[j + j + U(1)], of_two)
             else:
                 for j in range(pairs):
-                    line[j] = mean_of_two(above[j], below[j])
+                    line[j] = mean_of_two(above[j], below[j], of_two)
             made += pairs
             if width % across:
-                quads[made] = mean_of_two(above[width - U(1)], below[width - U(1)])
+                quads[made] = mean_of_two(above[width - U(1)], below[width - U(1)], of_two)
                 made += U(1)

@@ -2,7 +2,9 @@
 
 A drop shows the scene small: neighbouring pixels may look 50 pixels apart. A pixel's value is the mean over its area,
 taken here from `rays_along` squared rays, each of which stands for its part of the area (`pursuit`, `quadtree`). Two
-rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more.
+rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more. At the outline
+of a drop there are twice as many along a side, since they also tell how much of the pixel the drop hides: of 8 x 8 that
+share is wrong by 0.013 or so, which is more gray levels than all else.
 """
 
 from __future__ import annotations
@@ -166,12 +168,15 @@ class Minifier:
             return
         kinds = [_kind(self.traced(batch, RAYS)) for batch in batches]
         ends = np.cumsum([len(kind) for kind in kinds])[:-1]
-        edges = np.split(self.edges(np.concatenate([b.pixels for b in batches]), np.concatenate(kinds)), ends)
-        for batch, kind, edge in zip(batches, kinds, edges, strict=True):
-            rows = np.flatnonzero(edge | (kind == LIT))
-            for first in range(0, len(rows), CHUNK):
-                part = rows[first : first + CHUNK]
-                yield self._look(batch, part, self.traced(batch, side, part))
+        pixels = np.concatenate([batch.pixels for batch in batches])
+        edges, outlines = (np.split(found, ends) for found in self.edges(pixels, np.concatenate(kinds)))
+        for batch, kind, edge, outline in zip(batches, kinds, edges, outlines, strict=True):
+            fine = edge if self.lasting else outline
+            for some, along, together in ((~fine & (edge | (kind == LIT)), side, CHUNK), (fine, 2 * side, CHUNK // 4)):
+                rows = np.flatnonzero(some)
+                for first in range(0, len(rows), together):
+                    part = rows[first : first + together]
+                    yield self._look(batch, part, self.traced(batch, along, part))
             dark = np.flatnonzero(~edge & (kind == DARK))
             for first in range(0, len(dark), TOGETHER):
                 part = dark[first : first + TOGETHER]
@@ -206,14 +211,17 @@ class Minifier:
             opacity[:, part] = found.opacity[:, :count]
         return Samples(source, gain, opacity)
 
-    def edges(self, pixels: Indices, kinds: Status) -> Mask:
-        """Which pixels show something else than their neighbours; kinds: (M,), 0 for nothing."""
+    def edges(self, pixels: Indices, kinds: Status) -> tuple[Mask, Mask]:
+        """Which pixels show something else than their neighbours, and which are so at the outline of a drop.
+
+        kinds: (M,), 0 for nothing.
+        """
         width, height = self.camera.size
         of_frame: Status = np.full((height, width), NOTHING, dtype=np.uint8)
         of_frame.ravel()[pixels] = kinds
         around = np.ones((3, 3), dtype=np.uint8)
-        rough = cv2.dilate(of_frame, around) != cv2.erode(of_frame, around)
-        return np.asarray(rough.ravel()[pixels])
+        least, most = (reach(of_frame, around).ravel()[pixels] for reach in (cv2.erode, cv2.dilate))
+        return least != most, (least == NOTHING) & (most != NOTHING)
 
     # -- taps ----------------------------------------------------------------------------------------------------------
 

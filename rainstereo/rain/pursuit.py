@@ -14,8 +14,10 @@ What they have in common with one another depends on the level alone, and is tab
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -49,10 +51,13 @@ SCREENED, OFFERED = 12, 256
 """After so many texels of a pixel only so many others, those worth most then, are offered to it."""
 ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
 TOGETHER = 128  # pixels: few enough for the caches
+FINER, MOST_RAYS = 2, 0.7
+"""Levels by which a window must be finer that holds the most of a pixel's rays, so that it and the rest are apart."""
 FEW, DEAR = 2, 1.5
 """Levels below this have so many texels that making and finding them costs, too; what one of these counts for."""
 AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
-QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+POINTS_ALONG, MOST_ALONG = 32, 4
+"""Points along a pixel's side that rays stand for, each for its part, and along such a part at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,21 +90,52 @@ class Pursuit:
         """
         steps, span = steps_between(x, y, weights), span_of(x, y, weights)
         able = np.flatnonzero((self.level(span) >= 0) & ~self.tree.is_loose(span, steps, weights))
-        low = np.stack([ends_of(at, weights)[0] for at in (x, y)])[:, able]
-        rays = [columns[:, able] for columns in (x, y, weights)]
-        chosen = self._choose(rays[0], rays[1], rays[2], of_some(steps, able), low, span[able])
         rest = np.ones(len(span), dtype=np.bool_)
         rest[able] = False
         tree = self.tree.taps(x[:, rest], y[:, rest], weights[:, rest])
+        owner, share = self._parts(x[:, able], y[:, able], weights[:, able], span[able])
+        columns = able[owner]
+        chosen = self._choose(x[:, columns], y[:, columns], share, of_some(steps, columns))
         there = np.arange(MOST) < chosen.counts[:, None]
-        pixel = np.repeat(np.arange(len(able)), chosen.counts)
+        pixel = np.repeat(owner, chosen.counts)
         taps = whole(pixel, chosen.texel[there], chosen.weight[there], len(able), np.zeros(len(able)))
         return mixed(~rest, tree, taps)
 
-    def _choose(self, x: Array, y: Array, weights: Array, steps: Steps, low: Array, span: Array) -> _Chosen:
-        """Texels for rays at x, y (K, M). low: (2, M) least x and y, span: (M,)."""
-        count = weights.shape[1]
+    def _parts(self, x: Array, y: Array, weights: Array, span: Array) -> tuple[Indices, Array]:
+        """Parts of pixels that are told by windows of their own: whose each is, (P,) in order, and its weights, (K, P).
+
+        Pixels of whose rays most meet in a small place, and the rest do not, as beside a dark rim, are two parts.
+        """
         level = self.level(span)
+        wide = np.flatnonzero(level >= FINER)
+        inside = self._dense(*(columns[:, wide] for columns in (x, y, weights)), level[wide] - FINER)
+        two = inside.any(0) & (~inside & (weights[:, wide] > 0)).any(0)
+        wide, inside = wide[two], inside[:, two]
+        first, second = weights.copy(), weights[:, wide].copy()
+        first[:, wide] *= inside
+        second *= ~inside
+        owner = np.concatenate([np.arange(len(span)), wide])
+        order = np.argsort(owner, kind="stable")
+        return owner[order], np.concatenate([first, second], 1)[:, order]
+
+    def _dense(self, x: Array, y: Array, weights: Array, level: Indices) -> Mask:
+        """Which rays are in a window of a level, (M,), around the pixel's middle ray, (K, M), if `MOST_RAYS` are."""
+        away = np.zeros(weights.shape, dtype=np.float32)
+        for at in (x, y):
+            order = np.argsort(at, axis=0)
+            so_far = np.cumsum(np.take_along_axis(weights, order, 0), axis=0)
+            middle = (so_far < 0.5 * so_far[-1:]).sum(0)
+            centre = np.take_along_axis(at, np.take_along_axis(order, middle[None], 0), 0)
+            np.maximum(away, np.abs(at - centre), out=away)
+        inside = away <= 0.5 * ROOM * np.exp2(level.astype(np.float32))
+        dense = (weights * inside).sum(0) >= MOST_RAYS * weights.sum(0)
+        return np.asarray(inside & dense)
+
+    def _choose(self, x: Array, y: Array, weights: Array, steps: Steps) -> _Chosen:
+        """Texels for rays at x, y (K, M)."""
+        count = weights.shape[1]
+        level = np.maximum(self.level(span_of(x, y, weights)), 0)
+        low = np.stack([ends_of(at, weights)[0] for at in (x, y)])
         texel: Indices = np.zeros((count, MOST), dtype=np.intp)
         weight: Array = np.zeros((count, MOST))
         counts: Indices = np.zeros(count, dtype=np.intp)
@@ -116,17 +152,19 @@ class Pursuit:
         words, scale, count = _dictionary(level), 0.5**level, weights.shape[1]
         places = SIDE * BINS
         first = np.floor((low + 0.5) * scale).astype(np.intp) & -ALIGNED  # column and row of the window
-        bins: Indices = np.empty((len(QUARTERS), *weights.shape), dtype=np.intp)
+        along = min(max(POINTS_ALONG // math.isqrt(len(weights)), 1), MOST_ALONG)
+        parts = (np.arange(along) + 0.5) / along - 0.5
+        bins: Indices = np.empty((along**2, *weights.shape), dtype=np.intp)
         fine = np.float32(scale * BINS)
-        for part, (a, b) in enumerate(QUARTERS):
+        for part, (a, b) in enumerate(product(parts, parts)):
             j, i = (
-                (at + np.float32(a) * across + np.float32(b) * along + np.float32(0.5)) * fine - start
-                for at, across, along, start in zip((x, y), steps[:2], steps[2:], first * BINS, strict=True)
+                (at + np.float32(a) * right + np.float32(b) * below + np.float32(0.5)) * fine - start
+                for at, right, below, start in zip((x, y), steps[:2], steps[2:], first * BINS, strict=True)
             )
             j, i = (np.clip(at, 0, places - 1).astype(np.intp) for at in (j, i))
             bins[part] = i * places + j
         where = np.moveaxis(bins, -1, 0).reshape(count, -1)
-        share = np.tile(np.float32(0.25) * weights.T, len(QUARTERS))
+        share = np.tile(np.float32(1 / len(bins)) * weights.T, len(bins))
         if compiled.available():
             return self._compiled(level, first, where, share)
         common = _common(words, where, share)

@@ -193,10 +193,11 @@ def test_words_of_bytes(channels):
     packed = [words.packed(each) for each in (one, other, third, last)]
     words.unpack(packed[0].copy(), shown)
     np.testing.assert_array_equal(shown, one)
-    words.unpack(words.mean(packed[:2]), shown)
-    np.testing.assert_array_equal(shown, (one.astype(int) + other + 1) // 2)
-    words.unpack(words.mean(packed), shown)
-    np.testing.assert_array_equal(shown, (one.astype(int) + other + third + last + 2) // 4)
+    for up in (False, True):
+        words.unpack(words.mean(packed[:2], up), shown)
+        np.testing.assert_array_equal(shown, (one.astype(int) + other + up) // 2)
+        words.unpack(words.mean(packed, up), shown)
+        np.testing.assert_array_equal(shown, (one.astype(int) + other + third + last + 1 + up) // 4)
 
 
 def test_words_are_clipped_field_by_field():
