@@ -8,12 +8,13 @@ import numpy as np
 
 from rainstereo import compiled
 from rainstereo.compiled.layout import LONG_BITS, SHORT_BITS
+from rainstereo.types import Indices
 
 from .free_memory import give_back
 from .lookups import Lookups
 from .paste import Paste
 from .pursuit import Pursuit
-from .quadtree import Quadtree
+from .quadtree import Quadtree, Taps
 
 SIDE = 8  # pixels
 SPAN = 40  # of the rays of a pixel
@@ -32,9 +33,9 @@ def compile_ahead(sums: Pursuit | Quadtree) -> None:
 @cache
 def _draw() -> None:
     texels, weights = np.arange(4, dtype=np.int32), np.full(4, 256, dtype=np.int16)
-    one, clear = np.zeros(1, dtype=np.int32), np.zeros(1, dtype=np.float32)
-    nowhere, unknown = np.zeros((1, 2), dtype=np.float32), np.zeros(1, dtype=np.bool_)
-    table = Lookups(one, one, one + 4, texels, weights, clear, nowhere, unknown).ordered(SIDE)
+    one: Indices = np.zeros(1, dtype=np.intp)
+    taps = Taps(texels, weights, one + len(texels), np.zeros(1))
+    table = Lookups.of(one, one, taps, np.zeros(1), np.zeros((1, 2)), np.zeros(1, dtype=np.bool_)).ordered(SIDE)
     image = np.zeros((SIDE, SIDE, 3), dtype=np.uint8)
     for of_tap in ((np.int32, SHORT_BITS), (np.int64, LONG_BITS)):
         for some in (table, table.narrow((SIDE, SIDE))[0]):

@@ -99,7 +99,7 @@ class Lookups:
     def paired(self) -> Lookups:
         """The same, each texel and its weight in one number, if they fit."""
         taps = None if isinstance(self.texels, Column) else PairTaps.of(self.texels, self.weights)
-        return self if taps is None else replace(self, **{name: Column(taps, name) for name in OF_TAPS})
+        return self if taps is None else replace(self, texels=Column(taps, "texels"), weights=Column(taps, "weights"))
 
     def of_rows(self, keep: Mask) -> Lookups:
         """Some of the rows."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -104,19 +105,22 @@ class Outlines:
         width, height = self.size
         cells = height * (width + 1)  # a row's last line may end after its last pixel
         if np.minimum(math.pi * self.radius**2, cells).sum() < cells:
-            pixels, which = self.pixels()
-            pixels, first = np.unique(pixels, return_index=True)
-            return pixels, labels[which[first]]
-        over, total = np.zeros(cells, dtype=np.int32), np.zeros(cells)
+            every, which = self.pixels()
+            pixels, least = np.unique(every, return_index=True)
+            return pixels, labels[which[least]]
+        over: Any = np.zeros(cells, dtype=np.int32)
+        total: Array = np.zeros(cells)
         for first in range(0, len(self.x), BLOCK):
-            some = np.arange(first, min(first + BLOCK, len(self.x)))
+            some = np.arange(len(self.x))[first : first + BLOCK]
             drop, row, start, stop = self.take(some)._lines()
             of_line = labels[some].astype(np.float64)[drop]
             for sign, at in ((1, start), (-1, stop)):
                 cell = row * (width + 1) + at
                 over += sign * np.bincount(cell, minlength=cells).astype(np.int32)
                 total += np.bincount(cell, sign * of_line, cells)  # whole numbers: sums are exact
-        over, total = (np.cumsum(at, dtype=at.dtype).reshape(height, -1)[:, :width].ravel() for at in (over, total))
+        for sums in (over, total):
+            np.cumsum(sums, out=sums)
+        over, total = (np.ravel(sums.reshape(height, -1)[:, :width]) for sums in (over, total))
         pixels = np.flatnonzero(over)
         return pixels, (total[pixels] / over[pixels]).astype(np.intp)
 
