@@ -1,7 +1,12 @@
-"""Loops compiled before a large plan needs the memory that the compiler takes: some 100 MB, the first time."""
+"""Loops compiled before a large plan needs memory, the first time by another process.
+
+The compiler takes 100 MB and more, and never gives them back; machine code that is read from disk takes next to none.
+"""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from functools import cache
 
 import numpy as np
@@ -18,19 +23,44 @@ from .quadtree import Quadtree, Taps
 
 SIDE = 8  # pixels
 SPAN = 40  # of the rays of a pixel
-
-
-def compile_ahead(sums: Pursuit | Quadtree) -> None:
-    """Find the taps of one pixel, order, pack and draw them; nothing without numba."""
-    if compiled.available():
-        along = np.linspace(0, SPAN, SIDE, dtype=np.float32)
-        x, y = (at.reshape(-1, 1) for at in np.meshgrid(along, along))
-        sums.taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
-        _draw()
-        give_back()
+PATIENCE = 600.0  # seconds for another process; then this one compiles
+CHILD = """
+import sys
+sys.path[:] = {path!r}
+from rainstereo.rain import compile_ahead
+compile_ahead.compile_here({lasting})
+"""
 
 
 @cache
+def compile_ahead(lasting: bool) -> None:
+    """Have the loops ready that plans and frames of drops at rest need; nothing without numba."""
+    if not compiled.available():
+        return
+    from rainstereo.compiled.compile import folder
+
+    done = folder() / f"rain-ahead-{'lasting' if lasting else 'default'}"
+    if not done.exists():
+        told = CHILD.format(path=sys.path, lasting=lasting)
+        try:
+            subprocess.run([sys.executable, "-c", told], capture_output=True, timeout=PATIENCE, check=True)
+            done.touch()
+        except (OSError, ValueError, TypeError, subprocess.SubprocessError):
+            pass  # nowhere to keep it, or no Python to start: this process compiles
+    compile_here(lasting)
+
+
+def compile_here(lasting: bool) -> None:
+    """Find the taps of one pixel, order, pack and draw them."""
+    along = np.linspace(0, SPAN, SIDE, dtype=np.float32)
+    x, y = (at.reshape(-1, 1) for at in np.meshgrid(along, along))
+    tree = Quadtree((SIDE * SPAN,) * 2, 17, 1.0)
+    sums = Pursuit((SIDE * SPAN,) * 2, 1.0, tree) if lasting else tree
+    sums.taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
+    _draw()
+    give_back()
+
+
 def _draw() -> None:
     texels, weights = np.arange(4, dtype=np.int32), np.full(4, 256, dtype=np.int16)
     one: Indices = np.zeros(1, dtype=np.intp)

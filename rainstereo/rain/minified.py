@@ -116,7 +116,7 @@ class Minifier:
         if sum(len(batch.pixels) for batch in batches) > MANY:
             from .compile_ahead import compile_ahead  # which needs `paste`
 
-            compile_ahead(self._sums)
+            compile_ahead(self.lasting)
         for table in self._one_by_one(batches):
             every += len(table.texels)
             if size + table.size > JOINED:  # before the next ones come: the memory of these serves them

@@ -1,6 +1,7 @@
 """Taps held by their places in windows: the same numbers again, and frames; which pixels circles cover together."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -155,12 +156,37 @@ def test_loops_compiled_ahead_are_those_that_draw(lasting, monkeypatch):
     loops += [orders.reorder, sums.interleave, sums.lines, sums.sum_quads, windows.places]
     loops += [quads.pack, quads.pack_some, quads.average]
     renderer = Renderer(Camera.pinhole(400, 400, 101, 75, *SIZE), PANE, lasting=lasting)
-    compile_ahead(renderer._minifier._sums)
+    compile_ahead.cache_clear()
+    compile_ahead(lasting)
     before = [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
     monkeypatch.setattr(minified, "LARGE", 1000)
     plan = renderer.plan([SphericalCap((0.0, 0.0), 1e-3, 0.9), SphericalCap((3e-3, 0.0), 5e-4, 0.9)])
     plan.apply(np.zeros((*SIZE[::-1], 3), dtype=np.uint8))
     assert [len(loop.signatures) for loop in loops] == before  # type: ignore[attr-defined]
+
+
+@needs_numba
+def test_another_process_compiles_once_and_whatever_becomes_of_it_this_one_goes_on(tmp_path, monkeypatch):
+    from rainstereo.compiled import compile as how
+
+    monkeypatch.setattr(how, "folder", lambda: tmp_path)
+    ahead = sys.modules[compile_ahead.__module__]
+    told, here = [], []
+    monkeypatch.setattr(ahead.subprocess, "run", lambda command, **_: told.append(command))
+    monkeypatch.setattr(ahead, "compile_here", here.append)
+    for way in (True, True, False):
+        compile_ahead.cache_clear()
+        compile_ahead(way)
+    assert here == [True, True, False]
+    assert ["compile_here(True)" in command[2] for command in told] == [True, False]
+    for each in tmp_path.iterdir():
+        each.unlink()
+    monkeypatch.setattr(ahead.subprocess, "run", None)  # as if no process could be started
+    compile_ahead.cache_clear()
+    compile_ahead(True)
+    assert here[3:] == [True]
+    assert not list(tmp_path.iterdir())
+    compile_ahead.cache_clear()
 
 
 @pytest.mark.parametrize("count", [1, 7, 90, 400])
