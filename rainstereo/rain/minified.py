@@ -2,9 +2,9 @@
 
 A drop shows the scene small: neighbouring pixels may look 50 pixels apart. A pixel's value is the mean over its area,
 taken here from `rays_along` squared rays, each of which stands for its part of the area (`pursuit`, `quadtree`). Two
-rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more. At the outline
-of a drop there are twice as many along a side, since they also tell how much of the pixel the drop hides: of 8 x 8 that
-share is wrong by 0.013 or so, which is more gray levels than all else.
+rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more. At the
+outline of a drop there are twice as many along a side, since they also tell how much of the pixel the drop hides: of
+8 x 8 that share is wrong by 0.013 or so, which is more gray levels than all else.
 """
 
 from __future__ import annotations
