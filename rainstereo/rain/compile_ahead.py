@@ -8,6 +8,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def compile_ahead(lasting: bool) -> None:
     from rainstereo.compiled.compile import folder
 
     done = folder() / f"rain-ahead-{'lasting' if lasting else 'default'}"
-    if not done.exists():
+    if not done.exists() and Path(sys.executable or "").name.startswith("python"):  # not what else Python is built into
         told = CHILD.format(path=sys.path, lasting=lasting)
         try:
             subprocess.run([sys.executable, "-c", told], capture_output=True, timeout=PATIENCE, check=True)

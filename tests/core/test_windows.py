@@ -181,10 +181,15 @@ def test_another_process_compiles_once_and_whatever_becomes_of_it_this_one_goes_
     assert ["compile_here(True)" in command[2] for command in told] == [True, False]
     for each in tmp_path.iterdir():
         each.unlink()
+    with monkeypatch.context() as other:
+        other.setattr(sys, "executable", "/usr/bin/blender")
+        compile_ahead.cache_clear()
+        compile_ahead(True)
     monkeypatch.setattr(ahead.subprocess, "run", None)  # as if no process could be started
     compile_ahead.cache_clear()
     compile_ahead(True)
-    assert here[3:] == [True]
+    assert here[3:] == [True, True]
+    assert len(told) == 2
     assert not list(tmp_path.iterdir())
     compile_ahead.cache_clear()
 
