@@ -28,17 +28,18 @@ from rainstereo.types import Array, Image, Indices, Mask, Status
 
 from .free_memory import give_back
 from .lookups import JOINED, Lookups
-from .pursuit import Pursuit
+from .pursuit import Pursuit, forget
 from .quadtree import Quadtree
 from .samples import Samples
 
 RAYS = 2  # along a pixel's side, to begin with
 CHUNK = 4096  # pixels traced at a time with all their rays
 TOGETHER = 1 << 16  # pixels that are held at a time
+MANY = 1 << 17  # pixels of a plan whose loops are compiled before its tables take memory
 OUTLINE = 2
 """Times as many rays along a side at the outline of a drop, for plans that last."""
 CLEAR_STEP = 8
-LARGE = 1 << 22  # taps of a table that lasts
+LARGE = 1 << 22  # taps of a plan beyond which they are held in less memory, for a little more time in each frame
 NOTHING, DARK, LIT = 0, 1, 2  # of a pixel
 EXTENTS = ((0.75, 33), (2.5, 17), (6.0, 9), (60.0, 5), (math.inf, 3))
 """Texels that a pixel may span, up to a tolerance."""
@@ -112,26 +113,45 @@ class Minifier:
         """What every pixel of the batches that a drop covers looks at."""
         tables: list[Lookups] = []
         small: list[Lookups] = []
-        taps = every = 0
+        wide: list[Lookups] = []
+        size = every = 0
+        if sum(len(batch.pixels) for batch in batches) > MANY:
+            from .compile_ahead import compile_ahead  # which needs `paste`
+
+            compile_ahead(self.lasting)
         for table in self._one_by_one(batches):
             every += len(table.texels)
-            if taps + len(table.texels) > self._joined:  # before the next ones come: the memory of these serves them
+            if size + table.size > JOINED:  # before the next ones come: the memory of these serves them
                 tables += self._ordered(small)
-                taps = 0
+                size = 0
+                if every > LARGE:
+                    self._narrow(tables, wide)
+                    give_back()
             small.append(table)
-            taps += len(table.texels)
+            size += table.size
         tables += self._ordered(small)
         if every > LARGE:
+            self._narrow(tables, wide)
+            tables += [table.paired() for table in self._ordered(wide)]
+            forget()
             give_back()
         return tables
 
-    def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
-        return [table.ordered(self.camera.width) for table in Lookups.joined(tables, self._joined)]
+    def _narrow(self, tables: list[Lookups], wide: list[Lookups]) -> None:
+        """Hold tables in less memory. wide: what takes more, and is waiting until it is many."""
+        for i, table in enumerate(tables):
+            if self.lasting:  # with texels and weights that windows do not have
+                tables[i] = table.paired()
+                continue
+            tables[i], rest = table.narrow(self.source_size)
+            if len(rest.pixels):
+                wide.append(rest)
+        if sum(table.size for table in wide) > JOINED:
+            tables += [table.paired() for table in self._ordered(wide)]
+            wide.clear()
 
-    @property
-    def _joined(self) -> int:
-        """Taps up to which tables are joined: the more, the better their order serves the caches."""
-        return LARGE if self.lasting else JOINED
+    def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
+        return [table.ordered(self.camera.width) for table in Lookups.joined(tables)]
 
     def _one_by_one(self, batches: Sequence[Batch]) -> Iterator[Lookups]:
         """Tables of a few thousand pixels each; none is empty."""
@@ -161,7 +181,9 @@ class Minifier:
                     part = rows[first : first + CHUNK // more**2]
                     yield self._look(batch, part, self.traced(batch, more * side, part))
             dark = np.flatnonzero(~edge & (kind == DARK))
-            yield self._look(batch, dark, _darkness(len(dark)))
+            for first in range(0, len(dark), TOGETHER):
+                part = dark[first : first + TOGETHER]
+                yield self._look(batch, part, _darkness(len(part)))
 
     # -- tracing -------------------------------------------------------------------------------------------------------
 

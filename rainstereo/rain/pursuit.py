@@ -286,6 +286,11 @@ def _dictionary(level: int) -> _Dictionary:
     return _Dictionary(lags, gram.astype(np.float32))
 
 
+def forget() -> None:
+    """Give up what is tabulated of windows, 14 MB for each level; it is found anew when it is needed."""
+    _dictionary.cache_clear()
+
+
 def _common(words: _Dictionary, where: Indices, share: Image) -> Image:
     """Covariances of pixels with the texels of a window, (M, side^2). where, share: (M, K) of rays."""
     ends = np.arange(0, where.size + 1, where.shape[1])
