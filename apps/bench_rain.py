@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
@@ -112,39 +112,58 @@ def _dry_work(camera: Camera, pane: Chamber, image: Image, promised: bool) -> Wo
 def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised: bool) -> Work:
     lasting, default = Renderer(camera, pane, lasting=True), Renderer(camera, pane)
     coarse = Renderer(camera, pane, tolerance=COARSE)
-    variants = [Variant("cv2.remap of the frame", _remap(image, seed), _nothing, note="R")]
+    images = [*_others(camera.size), image]
+    frame = "cv2.remap of the frame"
+    variants = [Variant(frame, partial(_of_each, images, _remap(image, seed)), _nothing, note="R")]
     targets = []
-    for share, limit in ((0.02, 0.2), (0.1, 0.6), (0.4, 1.2)):
+    for share, limit in ((0.02, 0.2), (0.1, 0.6), (0.4, 1.2), (0.8, 1.2)):
         drops = _rain(camera, pane, share, seed)
         truth: Truth | None = None
         for renderer, name in ((lasting, ""), (default, ", by default"), (coarse, ", coarse")):
+            if share > 0.5 and renderer is not lasting:
+                continue
             plan = renderer.plan(drops)
             label = f"{100 * share:.0f} %{name}"
             truth = truth or Truth.of(plan, seed, SAMPLED if promised else FEW)
             variants.append(
                 Variant(
-                    label, partial(plan.apply, image), truth.error(image), True,
-                    f"{len(drops)} drops hide {100 * float((plan.opacity > 0).mean()):.0f} %; {truth.elsewhere(plan)}",
+                    label, partial(_of_each, images, plan.apply), truth.error(image), True,
+                    f"{len(drops)} drops hide {100 * float((plan.opacity > 0).mean()):.3g} %; {truth.elsewhere(plan)}",
                 )
             )  # fmt: skip
-            targets.append(Target(label, "cv2.remap of the frame", limit))
+            targets.append(Target(label, frame, limit))
     return Work(
         "still",
         "Drops that stand still",
-        "Planned before, with `Renderer(lasting=True)`, by default, and coarsely; the time is that of drawing a frame.",
+        f"{len(images)} frames in a row, of as many photographs. Planned before, with `Renderer(lasting=True)`, by "
+        "default, and coarsely; the time is that of drawing the frames.",
         tuple(variants),
         "10 %",
         "gray levels",
         f"RMS at some pixels inside drops against {SIDE} x {SIDE} exact rays a pixel",
+        len(images),
+        "frames",
         targets=tuple(targets) if promised else (),
     )
+
+
+def _others(size: tuple[int, int]) -> list[Image]:
+    """Other photographs."""
+    return [np.ascontiguousarray(cv2.resize(photograph(n), size, interpolation=cv2.INTER_AREA)) for n in OTHERS]
+
+
+def _of_each(images: Sequence[Image], draw: Callable[[Image], Image]) -> Image:
+    """Draws one after the other; returns the last."""
+    for image in images[:-1]:
+        draw(image)
+    return draw(images[-1])
 
 
 def _moving_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised: bool) -> Work:
     drops = _rain(camera, pane, 0.1, seed)
     truth = Truth.of(Renderer(camera, pane).plan(drops), seed, SAMPLED if promised else FEW)
     frame = "cv2.remap of the frame"
-    variants = [Variant(frame, _remap(image, seed), _nothing, note="R")]
+    variants = [Variant(frame, partial(_remap(image, seed), image), _nothing, note="R")]
     for moving, tolerance, name in (
         (True, 1.0, "10 %, all moving"), (True, COARSE, "10 %, all moving, coarse"), (False, 1.0, "10 %, as if still"),
     ):  # fmt: skip
@@ -192,7 +211,7 @@ def _blurred_work(camera: Camera, pane: Chamber, image: Image, seed: int, quick:
         "Drops out of focus, standing still",
         "Behind 4.5 mm at F/1.4 focused at infinity: a disc of 65 px.",
         (
-            Variant(frame, _remap(image, seed), _nothing, note="R"),
+            Variant(frame, partial(_remap(image, seed), image), _nothing, note="R"),
             Variant("nothing drawn", image.copy, error),
             Variant(name, partial(plan.apply, image), error, True, "traced before"),
         ),
@@ -232,7 +251,7 @@ def _merged_work(camera: Camera, pane: Chamber, image: Image, seed: int, promise
         "Drops that merge",
         "The height of the water at every pixel of the pane, drops that touch being one body.",
         (
-            Variant(frame, _remap(image, seed), _nothing, note="R"),
+            Variant(frame, partial(_remap(image, seed), image), _nothing, note="R"),
             Variant(name, lambda: field(drops, x, y), error, True),
             Variant("every drop at every pixel", dense, error, note="the same sum, written out", every=5),
         ),
@@ -311,16 +330,22 @@ def batch_work(seed: int, quick: bool) -> Work:
 
 
 def _rain(camera: Camera, pane: Chamber, share: float, seed: int) -> Drops:
-    """Drops that hide about this share of the frame."""
-    return Population.preset("drops").with_cover(share).sample(seed, Pane.seen(camera, pane))
+    """Drops that hide this share of the frame, to a drop: the first so many of a rain that hides more."""
+    drops = Population.preset("drops").with_cover(min(1.3 * share + 0.01, 0.95)).sample(seed, Pane.seen(camera, pane))
+    renderer, few, many = Renderer(camera, pane, moving=True), 1, len(drops)
+    while few < many:
+        some = (few + many) // 2
+        hidden = float((renderer.plan(drops.take(slice(some))).opacity > 0).mean())
+        few, many = (some + 1, many) if hidden < share else (few, some)
+    return drops.take(slice(few))
 
 
-def _remap(image: Image, seed: int) -> Callable[[], Image]:
-    """One interpolation of the whole frame, maps at hand: the yardstick."""
+def _remap(image: Image, seed: int) -> Callable[[Image], Image]:
+    """One interpolation of a whole frame of this size, maps at hand: the yardstick."""
     rng = np.random.default_rng(seed)
     maps = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in image.shape[1::-1])), -1)
     maps += rng.uniform(-3, 3, maps.shape).astype(np.float32)
-    return lambda: cv2.remap(image, maps, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+    return lambda some: cv2.remap(some, maps, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
 
 
 def _nothing(_: object) -> float:
@@ -373,8 +398,5 @@ class Truth:
 
     def elsewhere(self, plan: Plan) -> str:
         """The errors on other photographs."""
-        size, errors = plan.renderer.camera.size, []
-        for name in OTHERS:
-            image = np.ascontiguousarray(cv2.resize(photograph(name), size, interpolation=cv2.INTER_AREA))
-            errors.append(self.error(image)(plan.apply(image)))
+        errors = [self.error(image)(plan.apply(image)) for image in _others(plan.renderer.camera.size)]
         return f"{min(errors):.2g} to {max(errors):.2g} gray levels on {len(errors)} other photographs"

@@ -130,7 +130,7 @@ def points(
     bins x bins each. where, share: room. box: (4,) first and last column and row of the texels that are met, and some
     (around) more.
     """
-    count, most, total = U(0), np.float64(bins * side - U(1)), 0.0
+    count, most, total = U(0), np.float64(bins * side - U(1)), np.float64(0)
     part = np.float32(1 / len(parts) ** 2)
     left, top = np.float64(np.int64(column) * np.int64(bins)), np.float64(np.int64(row) * np.int64(bins))
     box[0], box[1], box[2], box[3] = side, -1, side, -1

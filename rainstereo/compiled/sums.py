@@ -32,7 +32,10 @@ def interleave(
     of taps of eight rows, 1 at least, by which `taps`, signed, are long: a weight, and in so many lowest bits its
     place. Rows that are missing to eight are as the last.
     """
-    rows, tap, first, place, last = U(len(counts)), U(0), U(0), np.int64(below), U(0)
+    rows, last = U(len(counts)), U(0)
+    tap: Any = U(0)
+    first: Any = U(0)
+    place: Any = np.int64(below)
     taps[:] = 0
     for eight in range(U(len(most))):
         for lane in range(EIGHT):
@@ -53,7 +56,7 @@ def interleave(
 
 
 @compiled
-def lines(taps: Any, most: Any, bits: int, counts: Any, places: Any) -> int:
+def lines(taps: Any, most: Any, bits: int, counts: Any, places: Any) -> Any:
     """Find quads that are not at hand since others of their cache line were looked at; returns how many.
 
     taps, most, bits: of `interleave`. counts: (ceil(M / 8),) of each eight rows. places: (n,) of the quads, as far as

@@ -114,7 +114,7 @@ class Pursuit:
         """
         level = self.level(span)
         wide = np.flatnonzero(level >= FINER)
-        inside = self._dense(*(columns[:, wide] for columns in (x, y, weights)), level[wide] - FINER)
+        inside = self._dense(x[:, wide], y[:, wide], weights[:, wide], level[wide] - FINER)
         two = inside.any(0) & (~inside & (weights[:, wide] > 0)).any(0)
         wide, inside = wide[two], inside[:, two]
         first, second = weights.copy(), weights[:, wide].copy()
@@ -157,12 +157,12 @@ class Pursuit:
     def _of_level(self, level: int, x: Array, y: Array, weights: Array, steps: Steps, low: Array) -> _Chosen:
         words, scale, count = _dictionary(level), 0.5**level, weights.shape[1]
         first = np.floor((low + 0.5) * scale).astype(np.intp) & -ALIGNED  # column and row of the window
-        along = min(max(POINTS_ALONG // math.isqrt(len(weights)), 1), MOST_ALONG)
-        parts = ((np.arange(along) + 0.5) / along - 0.5).astype(np.float32)
+        each = min(max(POINTS_ALONG // math.isqrt(len(weights)), 1), MOST_ALONG)
+        parts: Image = ((np.arange(each) + 0.5) / each - 0.5).astype(np.float32)
         if compiled.available():
             return self._compiled(level, first, x, y, weights, steps, parts)
         places, fine = SIDE * BINS, np.float32(scale * BINS)
-        bins: Indices = np.empty((along**2, *weights.shape), dtype=np.intp)
+        bins: Indices = np.empty((each**2, *weights.shape), dtype=np.intp)
         for part, (a, b) in enumerate(product(parts, parts)):
             j, i = (
                 (folded_along(at + a * right + b * below, n - 1, self.tree.border) + np.float32(0.5)) * fine - start
@@ -183,7 +183,7 @@ class Pursuit:
         return _Chosen(texel, weight, counts)
 
     def _compiled(
-        self, level: int, first: Indices, x: Array, y: Array, weights: Array, steps: Steps, parts: Array
+        self, level: int, first: Indices, x: Array, y: Array, weights: Array, steps: Steps, parts: Image
     ) -> _Chosen:
         from rainstereo.compiled.pursuit import choose
 
