@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from .cap_looks import rays_of_words, whole_of_words
-from .cap_rays import BLUE, CAP_SQUARE, GREEN, HALF, HIDDEN, ONE, PLANES, RED, ROOM, ZERO, fit
+from .cap_edges import box_of_rays, edges_of_words, has_own, own_rays
+from .cap_looks import ROUND, is_whole, whole_of_words
+from .cap_rays import CAP_SQUARE, CLEAR, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit
 from .cap_records import PIXELS, TAPS, record_rays, record_whole
+from .cap_shares import shares_of_row, taken
 from .cap_tiles import (
     AXX,
     AYY,
@@ -18,8 +20,6 @@ from .cap_tiles import (
     CX,
     CY,
     FAR,
-    LIT,
-    LITS,
     OUT_RADIUS,
     OUT_RIVALS,
     TILE,
@@ -28,11 +28,8 @@ from .cap_tiles import (
     hangs_over,
     move_up,
     next_span,
-    own_rays,
     patches,
     row_of_tile,
-    shares_of_row,
-    taken,
     widest,
 )  # fmt: skip
 from .compile import compiled
@@ -52,17 +49,18 @@ def frame(
     mode: DRAW: into `out`, (H, W, C) of up to three channels of bytes, which holds the clear image, from boxes of the
     scene in `words`. COUNT: how many pixels and taps there are, to record's counters. FILL: write them to record.
     scene: (h, w, C) bytes; only its size matters unless drawing. boxes: starts, widths, inverse distances (`boxes`).
-    border, shift: how the scene goes on, and where the frame is in it. looks: grids, and how many looks each has.
+    border, shift: how the scene goes on, and where the frame is in it. looks: grids, how many looks each has, how many of
+    the first look at four boxes each, bands of areas (`cap_tiles`), and area of a box over that of its part of a patch.
     side, parts: rays of pixels at edges. nodes, caps, ...: see `cap_rays`, `cap_tiles`.
     record: pixels, caps' numbers, taps a pixel, clear shares, displacements, unknown; texels, weights; counters.
     """
     starts, pitches, inverses = boxes
-    grids, counts = looks
+    grids, counts, fines, bands, wider = looks
     height, width = out.shape[0], out.shape[1]
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
     rays, line = np.zeros(PLANES * 64, dtype=np.float32), np.zeros(15, dtype=np.float32)
-    tile, total, at = np.zeros((5, 3, 3), np.float32), np.zeros(4, np.float32), np.zeros(64, np.uint32)
-    most, number_of_looks = len(counts) - 1, counts[0]
+    tile, total, at = np.zeros((5, 3, 3), np.float32), np.zeros(4, np.float32), np.zeros(ROUND * 64, np.uint32)
+    quarters, slots = np.zeros(ROUND * 64, np.uint32), np.zeros((3, ROUND), np.int64)
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
@@ -89,103 +87,105 @@ def frame(
                     if high <= low and not hangs:
                         known = False
                         continue
-                    row_of_tile(tile, t, s, not known, (low, high), following, cap, later, view, line, rays)
+                    begin, end = row_of_tile(
+                        tile, t, s, not known, (low, high), following, cap, later, view, line, rays
+                    )  # fmt: skip
                     known = low < high
-                    patches(rays, low, high, number_of_looks, most, shift, last)
+                    patches(rays, begin, end, bands, wider, shift, last)
                     shares_of_row(tile, t, s, lanes, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
                         taken(tile, t, s, lanes, wide, caps, number, rivals, outline, line, rays)
                     if mode != DRAW:
                         record_row(
-                            mode == FILL, v * width + u1, number, lanes, low, high, tiny, hangs, tile, t, s, edge, cap,
-                            later, view, side, parts, (scene.shape[1], scene.shape[0]), starts, pitches, inverses,
-                            border, shift, grids, counts, rays, at, total, len(words), width, record,
+                            mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, tile, t, s, edge,
+                            caps, outlines, later, view, side, parts, (scene.shape[1], scene.shape[0]), starts, pitches,
+                            inverses, border, shift, grids, counts, fines, rays, at, quarters, total, len(words), width,
+                            record,
                         )  # fmt: skip
                         continue
-                    nothing_shown(rays)
+                    for j in range(np.uint64(3 * 64)):
+                        rays[SHOWN + j] = ZERO
                     if not tiny:
                         whole_of_words(
-                            words, scene, starts, pitches, inverses, last, border, grids, counts, low, high, rays,
-                            total, at,
+                            words, scene, starts, pitches, inverses, last, border, grids, counts, fines, begin, end,
+                            rays, total, at, quarters, slots,
                         )  # fmt: skip
-                    for lane in range(low, high):
-                        j = np.uint64(lane)
-                        if not rays[HIDDEN + j] > ZERO or not (tiny or ZERO < rays[LITS + j] < np.float32(LIT)):
-                            continue
-                        near = not rays[ROOM + j] > edge
-                        share = own_rays(tile, t, s + np.float32(lane), near, cap, later, view, side, parts, rays)
-                        rays[HIDDEN + j] = max(share, rays[HIDDEN + j]) if hangs and not tiny else share
-                        total[0] = total[1] = total[2] = ZERO
-                        rays_of_words(
-                            words, scene, starts, pitches, inverses, last, shift, border, rays, side, parts, total
-                        )
-                        rays[RED + j], rays[GREEN + j], rays[BLUE + j] = total[0], total[1], total[2]
+                    edges_of_words(
+                        words, scene, starts, pitches, inverses, last, shift, border, tile, t, s, u1, v, edge,
+                        hangs, tiny, caps, number, outlines, later, view, side, parts, low, high, rays, total, at,
+                    )  # fmt: skip
                     write_bytes(out, v, u1, lanes, rays)
 
 
 @compiled
 def record_row(
-    filling: bool, first: Any, number: Any, lanes: Any, low: Any, high: Any, tiny: bool, hangs: bool, tile: Any,
-    t: Any, s: Any, edge: Any, cap: Any, later: Any, view: Any, side: Any, parts: Any, size: Any,
-    starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
-    counts: Any, rays: Any, at: Any, mean: Any, boxes: Any, width: Any, record: Any,
+    filling: bool, u: Any, v: Any, number: Any, lanes: Any, low: Any, high: Any, begin: Any, end: Any, tiny: bool,
+    hangs: bool, tile: Any, t: Any, s: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
+    side: Any, parts: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
+    counts: Any, fines: Any, rays: Any, at: Any, quarters: Any, mean: Any, boxes: Any, width: Any, record: Any,
 ) -> None:  # fmt: skip
-    """Count, or write down, a row's pixels. first: number of the pixel of lane 0. boxes: how many there are."""
+    """Count, or write down, a row's pixels. u, v: column of lane 0, and row. boxes: how many there are."""
     pixels, of_caps, taps, clear, moved, unknown, texels, weights, cursor = record
+    last = np.float32(size[0] - 1), np.float32(size[1] - 1)
     for lane in range(lanes):
         j = np.uint64(lane)
         if not rays[HIDDEN + j] > ZERO:
             continue
-        lit = rays[LITS + j] if low <= lane < high else ZERO
         before, off = cursor[TAPS], False
-        mean[0] = mean[1] = np.float32(np.nan)
-        if lit == np.float32(LIT) and not tiny:
+        mean[:] = ZERO
+        if begin <= lane < end and is_whole(rays, j) and not tiny:
             record_whole(
-                starts, pitches, inverses, size, border, grids, counts, rays, lane, boxes, at, texels, weights, cursor,
-                filling,
+                starts, pitches, inverses, size, border, grids, counts, fines, rays, lane, boxes, at, quarters, texels,
+                weights, cursor, filling,
             )  # fmt: skip
             bend = np.float32(1 / 24)
             mean[0] = rays[CX + j] - shift[0] + (rays[AXX + j] + rays[BXX + j]) * bend
             mean[1] = rays[CY + j] - shift[1] + (rays[AYY + j] + rays[BYY + j]) * bend
+            mean[2] = ONE
             off = not rays[FAR + j] >= ZERO
-        elif (lit > ZERO or tiny) and low <= lane < high:
-            near = not rays[ROOM + j] > edge
-            share = own_rays(tile, t, s + np.float32(lane), near, cap, later, view, side, parts, rays)
-            rays[HIDDEN + j] = max(share, rays[HIDDEN + j]) if hangs and not tiny else share
-            off = record_rays(
-                starts, pitches, inverses, size, shift, border, rays, side, parts, boxes, texels, weights, cursor,
-                filling, mean,
-            )  # fmt: skip
+        elif has_own(rays, lane, low, high, tiny):
+            rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
+            near = rival >= 0 or not rays[ROOM + j] > edge
+            for which in (number, rival):
+                if which < 0:
+                    continue
+                hidden += own_rays(
+                    tile, t, s + np.float32(lane), near, which, caps, number, rival, later, view, side, parts, rays
+                )  # fmt: skip
+                square, far = box_of_rays(rays, side, u + lane, v, outlines[which], last, shift)
+                record_rays(
+                    starts, pitches, inverses, size, shift, border, rays, side, square, boxes, texels, weights,
+                    cursor, filling, mean,
+                )  # fmt: skip
+                off |= far
+            rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
         if not rays[HIDDEN + j] > ZERO:
             cursor[TAPS] = before
             continue
         if filling:
-            row, pixel = cursor[PIXELS], first + lane
+            row, pixel = cursor[PIXELS], v * width + u + lane
             pixels[row], of_caps[row], taps[row] = pixel, number, cursor[TAPS] - before
             clear[row], unknown[row] = max(ONE - rays[HIDDEN + j], ZERO), off
-            moved[row, 0] = mean[0] - np.float32(pixel % width)
-            moved[row, 1] = mean[1] - np.float32(pixel // width)
+            moved[row, 0] = mean[0] / mean[2] - np.float32(u + lane) if mean[2] > ZERO else np.float32(np.nan)
+            moved[row, 1] = mean[1] / mean[2] - np.float32(v) if mean[2] > ZERO else np.float32(np.nan)
         cursor[PIXELS] += 1
-
-
-@compiled
-def nothing_shown(rays: Any) -> None:
-    """Of a row, to begin with."""
-    for j in range(np.uint64(3 * 64)):
-        rays[RED + j] = ZERO
 
 
 @compiled
 def write_bytes(out: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
     """Mix what a row shows with what is there, where a cap hides it."""
     channels = np.uint64(out.shape[2])
-    row, plane = out[v].ravel(), np.uint64(64)
+    first, row, three = np.uint64(u) * channels, out[v].ravel(), np.uint64(3)
     for j in range(np.uint64(lanes)):
-        hidden = rays[HIDDEN + j]
-        if hidden > ZERO:
-            at = (np.uint64(u) + j) * channels
-            for channel in range(channels):
-                value = rays[RED + plane * channel + j] + HALF
-                if hidden < ONE:
-                    value += (ONE - hidden) * np.float32(row[at + channel])
-                row[at + channel] = np.uint8(np.int32(value if value < WHITE else WHITE))
+        for channel in range(three):
+            rays[CLEAR + three * j + channel] = ONE - rays[HIDDEN + j]
+    if channels == three:
+        for k in range(three * np.uint64(lanes)):
+            value = rays[SHOWN + k] + rays[CLEAR + k] * np.float32(row[first + k]) + HALF
+            row[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))
+        return
+    for j in range(np.uint64(lanes)):
+        for channel in range(channels):
+            k, at = three * j + channel, first + j * channels + channel
+            value = rays[SHOWN + k] + rays[CLEAR + k] * np.float32(row[at]) + HALF
+            row[at] = np.uint8(np.int32(value if value < WHITE else WHITE))

@@ -19,14 +19,16 @@ from .compile import inlined
 
 PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
 OWN, SIDES, ABOVE, BELOW = (np.uint64(64 * i) for i in (11, 14, 17, 20))
-"""Rays of a row of pixels: through their middles, their left and right sides, and above and below; places, and gain."""
+"""Rays of a row of pixels: through their middles, the middles of their left sides, and their upper and lower left
+corners; places, and gain."""
 SUB = np.uint64(64 * 23)  # of one pixel
 PATCH = np.uint64(64 * 26)
-HIDDEN, RED, GREEN, BLUE = (np.uint64(64 * i) for i in (43, 44, 45, 46))
-"""Of a row: the share of each pixel that a cap hides, and what it shows there."""
-STEPS = np.uint64(64 * 47)
-"""From a pixel's own rays to their neighbours: pairs of planes."""
-PLANES = 73
+HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))
+"""Of a row: the share of each pixel that a cap hides; and 1 + the number of another that shows some of it, or 0."""
+SHOWN, CLEAR = np.uint64(64 * 45), np.uint64(64 * 48)
+"""What a row shows, three channels a pixel, and the share that is clear, thrice."""
+WEIGHT = np.uint64(64 * 51)
+PLANES = 52
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
@@ -117,7 +119,7 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
     square, depth, curvature = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH]), np.float32(cap[CAP_CURVATURE])
     n = np.float32(cap[CAP_INDEX])
     q = n * n
-    over = (ONE - q) * curvature
+    inverse, less = ONE / q, ONE - q
     first, last = np.uint64(low), np.uint64(high)
     for j in range(first, last):
         px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
@@ -126,14 +128,14 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
         b = kz * depth + px * kx + py * ky
         root = np.float32(math.sqrt(b * b + room * q))
         # the root of the quadratic, as the product of both roots over the other
-        s = room / (b + root) if b >= ZERO else (root - b) / q
+        s = room / (b + root) if b >= ZERO else (root - b) * inverse
         before = root * curvature  # component of the wave vector along the sphere's normal
-        inside = before * before + (ONE - q)
+        inside = before * before + less
         turned = np.float32(math.sqrt(inside))
-        bend = over / (turned + before)
         p, t = before + q * turned, before + turned
-        pt = p * t
-        passed = (before * turned + before * turned) * (p * p + q * t * t) / (pt * pt)
+        both = ONE / (p * t)
+        bend = less * curvature * (p * both)
+        passed = (before * turned + before * turned) * (p * p + q * t * t) * (both * both)
         rise = s * kz
         px += s * kx
         py += s * ky
