@@ -1,8 +1,8 @@
 """Means over squares of an image that overlap, so that the nearest one to any place is nearly centred there.
 
 Box j of a size along an axis is centred on the edge between the pixels t j - 1 and t j, t the pixels between them; beyond
-the image's edges it goes on mirrored, to about a pixel. Three channels of bytes stand in a word, 21 bits apart
-(`rain.words`), 64 times as large. A size between two others is the mean of both: the square of its width is theirs'.
+the image's edges it goes on mirrored, to about a pixel. Three channels of bytes stand in a word of 32 bits, four times as
+large: small words are read sooner. A size between two others is the mean of both: the square of its width is theirs'.
 """
 
 from __future__ import annotations
@@ -12,11 +12,46 @@ from typing import Any
 import numpy as np
 
 from .compile import compiled, inlined
-from .layout import EVERY
 
-ONE, TWO = np.uint64(1), np.uint64(2)
-ROUND = np.uint64(2 * EVERY)  # what makes a fourth of a sum its nearest
-MASK, HALF_MASK = np.uint64(0xFFFF * EVERY), np.uint64(0x7FFF * EVERY)
+BITS = 10  # of a channel in a word
+FIELD, TWICE = np.uint32(BITS), np.uint32(2 * BITS)
+FIRST = np.uint32((1 << BITS) - 1)
+OUTER, MIDDLE = np.uint64(FIRST | (FIRST << TWICE)), np.uint64(FIRST << FIELD)
+WIDE = 20
+"""Bits of a channel in a word that has been spread: 0 up, the last channel's from 20 and the middle one's from 40 on."""
+TO_WIDE = np.uint64(2 * WIDE - BITS)
+EVEN = np.uint32(0x3FFFFFFF & ~((1 << 2 * BITS) + (1 << BITS) + 1))  # all but the last bit of each channel
+ONE, SHIFT = np.uint64(1), np.uint32(1)
+
+
+@inlined
+def spread(word: Any) -> Any:
+    """A word's channels with room for a million between them: sums and weighted sums of such words are the channels'."""
+    word = np.uint64(word)
+    return (word & OUTER) + ((word & MIDDLE) << TO_WIDE)
+
+
+@inlined
+def channels_of(found: Any) -> Any:
+    """The three channels of a sum of words that were spread."""
+    field, most = np.uint64(WIDE), np.uint64((1 << WIDE) - 1)
+    return (
+        np.float32(np.int64(found & most)),
+        np.float32(np.int64(found >> (field + field))),
+        np.float32(np.int64((found >> field) & most)),
+    )
+
+
+@compiled
+def pack(values: Any, words: Any) -> None:
+    """Words of bytes, (N, 1 or 3), as large as they are."""
+    if values.shape[1] == 1:
+        for i in range(np.uint64(len(words))):
+            words[i] = np.uint32(values[i, 0])
+        return
+    for i in range(np.uint64(len(words))):
+        one, two = np.uint32(values[i, np.uint64(1)]) << FIELD, np.uint32(values[i, np.uint64(2)]) << TWICE
+        words[i] = np.uint32(values[i, np.uint64(0)]) | one | two
 
 
 @compiled
@@ -36,19 +71,26 @@ def first_boxes(cells: Any, boxes: Any) -> None:
         one, other, out = cells[max(j - 1, 0)], cells[min(j, height - 1)], boxes[j]
         for i in (0, width):
             a, b = np.uint64(max(i - 1, 0)), np.uint64(min(i, width - 1))
-            out[np.uint64(i)] = ((one[a] + one[b]) + (other[a] + other[b])) << np.uint64(4)
+            out[np.uint64(i)] = (one[a] + one[b]) + (other[a] + other[b])
         for i in range(ONE, np.uint64(width)):
-            out[i] = ((one[i - ONE] + one[i]) + (other[i - ONE] + other[i])) << np.uint64(4)
+            out[i] = (one[i - ONE] + one[i]) + (other[i - ONE] + other[i])
+
+
+@inlined
+def _lower(a: Any, b: Any) -> Any:
+    """The mean of two words, channel by channel, rounded down."""
+    return (a & b) + (((a ^ b) & EVEN) >> SHIFT)
+
+
+@inlined
+def _upper(a: Any, b: Any) -> Any:
+    """The same, rounded up."""
+    return (a | b) - (((a ^ b) & EVEN) >> SHIFT)
 
 
 @inlined
 def _mean(a: Any, b: Any, c: Any, d: Any) -> Any:
-    return (((a + b) + (c + d) + ROUND) >> TWO) & MASK
-
-
-@inlined
-def _between(a: Any, b: Any) -> Any:
-    return ((a + b) >> ONE) & HALF_MASK
+    return _upper(_lower(a, b), _lower(c, d))  # too large as often as too small
 
 
 @compiled
@@ -71,15 +113,15 @@ def next_boxes(boxes: Any, apart: Any, step: Any, between: Any, larger: Any) -> 
                 at = step * i
                 a, b = np.uint64(mirrored(at - apart, across)), np.uint64(mirrored(at + apart, across))
                 out[np.uint64(i)] = _mean(one[a], one[b], other[a], other[b])
-                middle[np.uint64(i)] = _between(own[np.uint64(mirrored(at, across))], out[np.uint64(i)])
+                middle[np.uint64(i)] = _lower(own[np.uint64(mirrored(at, across))], out[np.uint64(i)])
         if step == 1:
             for i in range(np.uint64(first), wide):
                 mean = _mean(one[i - far], one[i + far], other[i - far], other[i + far])
                 out[i] = mean
-                middle[i] = _between(own[i], mean)
+                middle[i] = _lower(own[i], mean)
         else:
             for i in range(np.uint64(first), wide):
                 at = i + i
                 mean = _mean(one[at - far], one[at + far], other[at - far], other[at + far])
                 out[i] = mean
-                middle[i] = _between(own[at], mean)
+                middle[i] = _lower(own[at], mean)

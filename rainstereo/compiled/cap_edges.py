@@ -11,8 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from .cap_looks import FIELD, INSIDE, MASK, SCALE, TWICE, TWO_, folded, pixel_value, size_of
+from .boxes import FIELD, FIRST, TWICE
+from .cap_looks import INSIDE, ONE_, SCALE, TWO_, folded, pixel_value, size_of
 from .cap_rays import (
+    CAP_CURVATURE,
+    CAP_DEPTH,
+    CAP_INDEX,
     CAP_SQUARE,
     DIM,
     GAIN,
@@ -36,9 +40,12 @@ from .cap_rays import (
 from .cap_shares import contact_share, from_rival
 from .cap_tiles import LITS, WHOLE, along, down, value_on
 from .compile import compiled, inlined
+from .prefetch import to_read
 
 DRAWN_OUT, ROUND = np.float32(4), np.float32(1.44)
 """Area of boxes over what rays along a dark line are apart, squared; and where no ray is dark."""
+
+SOFTEST = np.float32(1e-3)  # less is lost in rounding
 
 
 @inlined
@@ -75,6 +82,7 @@ def own_rays(
         rays[KY + j] = ky + (x * bu + y * bv)
         rays[DIM + j] = dim
         rays[SHARE + j] = parts[np.uint64(128) + j]
+    dx, dy = ZERO, ZERO
     if rival >= 0:
         dx, dy, need = from_rival(caps, number, rival)
         square, other = np.float32(caps[number, CAP_SQUARE]), np.float32(caps[rival, CAP_SQUARE])
@@ -95,10 +103,23 @@ def own_rays(
     for j in range(np.uint64(side * side)):
         total += rays[SHARE + j]
     part *= part
-    cross(caps[which], later, view, rays, 0, np.int64(lanes), SUB)
+    if rival >= 0 and which != number:
+        px, py = px - dx, py - dy
+    cap = caps[which]
+    step = softness(cap, px, py, kx, ky, xu, xv, yu, yv) / np.float32(side)
+    cross(cap, later, view, rays, 0, np.int64(lanes), SUB, True, step if step > SOFTEST else SOFTEST)
     for j in range(lanes):
         rays[WEIGHT + j] = rays[SUB + GAIN + j] * rays[SHARE + j] * part
     return total / np.float32(side * side)
+
+
+@inlined
+def softness(cap: Any, px: Any, py: Any, kx: Any, ky: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
+    """Half of how much the square of the wave vector's component along a cap's normal changes over a pixel."""
+    q, curvature, depth = np.float32(cap[CAP_INDEX] ** 2), np.float32(cap[CAP_CURVATURE]), np.float32(cap[CAP_DEPTH])
+    b = np.float32(math.sqrt(q - kx * kx - ky * ky)) * depth + px * kx + py * ky
+    gu, gv = b * (kx * xu + ky * yu) - q * (px * xu + py * yu), b * (kx * xv + ky * yv) - q * (px * xv + py * yv)
+    return curvature * curvature * np.float32(math.sqrt(gu * gu + gv * gv))
 
 
 @compiled
@@ -159,12 +180,14 @@ def rays_of_words(
         boxes_of_rays(starts[size], pitches[size], inverses[size], last, shift, border, rays, side, at)
     else:
         boxes_of_rays(starts[size], pitches[size], inverses[size], last, shift, INSIDE, rays, side, at)
+    for j in range(count):
+        to_read(words, np.uint64(at[j]))
     red, green, blue = ZERO, ZERO, ZERO
     for j in range(count):
         weight, word = rays[WEIGHT + j], words[np.uint64(at[j])]
-        red += weight * np.float32(np.int64(word & MASK))
-        green += weight * np.float32(np.int64((word >> FIELD) & MASK))
-        blue += weight * np.float32(np.int64(word >> TWICE))
+        red += weight * np.float32(np.int32(word & FIRST))
+        green += weight * np.float32(np.int32((word >> FIELD) & FIRST))
+        blue += weight * np.float32(np.int32(word >> TWICE))
     total[0] += red * SCALE
     total[1] += green * SCALE
     total[2] += blue * SCALE
@@ -200,4 +223,4 @@ def edges_of_words(
             )  # fmt: skip
         rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
         k = SHOWN + j + j + j
-        rays[k], rays[k + np.uint64(1)], rays[k + TWO_] = total[0], total[1], total[2]
+        rays[k], rays[k + ONE_], rays[k + TWO_] = total[0], total[1], total[2]

@@ -33,13 +33,11 @@ from .cap_tiles import (
     PART,
     WHOLE,
 )  # fmt: skip
+from .boxes import channels_of, spread
 from .compile import compiled, inlined
-from .layout import FIELD as BITS
 from .prefetch import to_read
 
-FIELD, TWICE = np.uint64(BITS), np.uint64(2 * BITS)
-MASK = np.uint64((1 << BITS) - 1)
-SCALE = np.float32(1 / 64)  # of words
+SCALE = np.float32(1 / 4)  # of words
 MIRROR, EDGE, INSIDE = 0, 1, 2
 """How the scene goes on beyond its edges; or that nothing lies beyond them."""
 FINEST = np.float32(4)
@@ -162,7 +160,7 @@ def sum_of(words: Any, at: Any, first: Any, count: Any) -> Any:
     """Of some boxes."""
     found = np.uint64(0)
     for look in range(first, first + np.uint64(count)):
-        found += words[np.uint64(at[look])]
+        found += spread(words[np.uint64(at[look])])
     return found
 
 
@@ -173,7 +171,8 @@ def sum_of_means(words: Any, pitch: Any, at: Any, parts: Any, first: Any, count:
     for look in range(first, first + np.uint64(count)):
         k, part = np.uint64(at[look]), np.uint64(parts[look])
         u, v = part & np.uint64(3), part >> TWO_
-        a, b, c, d = words[k], words[k + ONE_], words[k + line], words[k + line + ONE_]
+        a, b = spread(words[k]), spread(words[k + ONE_])
+        c, d = spread(words[k + line]), spread(words[k + line + ONE_])
         upper = (a << TWO_) + (b - a) * u  # channels' differences may be negative; the words' sums are not
         lower = (c << TWO_) + (d - c) * u
         found += (upper << TWO_) + (lower - upper) * v
@@ -182,11 +181,10 @@ def sum_of_means(words: Any, pitch: Any, at: Any, parts: Any, first: Any, count:
 
 @inlined
 def show(rays: Any, j: Any, found: Any, gain: Any) -> None:
-    """Write what a pixel shows: a sum of words, unpacked."""
+    """Write what a pixel shows: a sum of words."""
     k = SHOWN + j + j + j
-    rays[k] = gain * np.float32(np.int64(found & MASK))
-    rays[k + ONE_] = gain * np.float32(np.int64((found >> FIELD) & MASK))
-    rays[k + TWO_] = gain * np.float32(np.int64(found >> TWICE))
+    one, two, three = channels_of(found)
+    rays[k], rays[k + ONE_], rays[k + TWO_] = gain * one, gain * two, gain * three
 
 
 @inlined

@@ -110,16 +110,21 @@ def room_of_row(line: Any, s: Any, lanes: Any, square: Any, rays: Any) -> None:
 
 
 @inlined
-def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: Any) -> None:
+def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: Any, soft: bool, spread: Any) -> None:
     """Rays that have been taken up, through the cap, the rest of the chamber and to the scene; written from `to` on.
 
     The gain is 0 where no light comes through. later: (F, 3) float32, thickness before a face and the indices
     on both sides, of the faces behind the cap's.
+    soft: each ray stands for light about it, over which the square of the wave vector's component along the normal
+    behind the cap goes from `spread` below to as much above the ray's. That component is what places and gains depend
+    on, nearly linearly, also where it ends, at the critical angle, and they as steeply as a square root: so its mean
+    gives the light's gain, and its mean weighted with itself the light's middle.
     """
     square, depth, curvature = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH]), np.float32(cap[CAP_CURVATURE])
     n = np.float32(cap[CAP_INDEX])
     q = n * n
     inverse, less = ONE / q, ONE - q
+    third, fourth = ONE / (np.float32(3) * spread), ONE / (FOUR * spread)
     first, last = np.uint64(low), np.uint64(high)
     for j in range(first, last):
         px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
@@ -131,11 +136,17 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
         s = room / (b + root) if b >= ZERO else (root - b) * inverse
         before = root * curvature  # component of the wave vector along the sphere's normal
         inside = before * before + less
-        turned = np.float32(math.sqrt(inside))
+        turned = mean = np.float32(math.sqrt(inside))
+        if soft:
+            high, low_ = inside + spread, inside - spread
+            high, low_ = (high if high > ZERO else ZERO), (low_ if low_ > ZERO else ZERO)
+            mean = (high * np.float32(math.sqrt(high)) - low_ * np.float32(math.sqrt(low_))) * third
+            turned = (high + low_) * (high - low_) * fourth / (mean if mean > ZERO else ONE)
+            inside = high
         p, t = before + q * turned, before + turned
         both = ONE / (p * t)
         bend = less * curvature * (p * both)
-        passed = (before * turned + before * turned) * (p * p + q * t * t) * (both * both)
+        passed = (before * mean + before * mean) * (p * p + q * t * t) * (both * both)
         rise = s * kz
         px += s * kx
         py += s * ky

@@ -16,7 +16,7 @@ from rainstereo.types import Array, Image
 
 from .pyramid import half
 
-SCALE = 64  # of bytes in words
+SCALE = 4  # of bytes in words
 SECOND = 2  # pixels between the boxes of up to `DENSE` pixels
 DENSE = 16
 LARGEST = 1024
@@ -61,14 +61,13 @@ class Boxes:
         return [(k, 2 ** (k // 2) // steps[k - 2], steps[k] // steps[k - 2]) for k in range(2, len(steps), 2)]
 
     def words(self, image: Image) -> Any:
-        """All boxes of bytes, (H, W, 1 or 3), as (count,) uint64."""
+        """All boxes of bytes, (H, W, 1 or 3), as (count,) uint32."""
         from rainstereo.compiled import boxes as loops
-        from rainstereo.compiled.words import pack
 
         small = half(image)
-        cells = np.empty(small.shape[:2], dtype=np.uint64)
-        pack(small.reshape(cells.size, -1), 0, small.shape[2], cells.ravel())
-        found = np.empty(self.count, dtype=np.uint64)
+        cells = np.empty(small.shape[:2], dtype=np.uint32)
+        loops.pack(small.reshape(cells.size, -1), cells.ravel())
+        found = np.empty(self.count, dtype=np.uint32)
         loops.first_boxes(cells, self.part(found, 0))
         for k, apart, step in self.octaves:
             loops.next_boxes(self.part(found, k - 2), apart, step, self.part(found, k - 1), self.part(found, k))

@@ -33,7 +33,7 @@ from .outlines import Outlines
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE = ((24.0, 8), (40.0, 16), (80.0, 25), (math.inf, 36)), 5
+FINE = ((24.0, 8), (40.0, 16), (80.0, 25), (math.inf, 36)), 4
 COARSE = ((16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)), 3
 """Square root of the area, pixels, up to which what a pixel shows gets how many looks, the first of them at four boxes
 each; and rays along the side of a pixel at an edge."""
@@ -317,7 +317,7 @@ class CapTable:
     def _tabulated(self) -> _Tabulated:
         width, height = self.scene.camera.size
         out, image = (np.zeros((h, w, 0), dtype=np.uint8) for w, h in ((width, height), self.scene.size))
-        words = np.zeros(self.scene.boxes.count, dtype=np.uint64)
+        words = np.zeros(self.scene.boxes.count, dtype=np.uint32)
         record = _record(0, 0)
         self.scene.go(COUNT, out, image, words, self, record)
         pixels, taps = record[-1].tolist()
