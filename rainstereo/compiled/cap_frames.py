@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .cap_edges import box_of_rays, edges_of_words, has_own, own_rays
+from .cap_edges import box_of_rays, edges_of_words, form_of, has_own, own_rays
 from .cap_looks import ROUND, is_whole, whole_of_words
 from .cap_rays import CAP_SQUARE, CLEAR, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit
 from .cap_records import PIXELS, TAPS, record_rays, record_whole
@@ -41,7 +41,7 @@ WHITE = np.float32(255)
 @compiled
 def frame(
     mode: Any, out: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, looks: Any,
-    side: Any, parts: Any, nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
+    sides: Any, parts: Any, nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
     record: Any,
 ) -> None:  # fmt: skip
     """Go over the pixels of caps, in the order of the caps.
@@ -50,12 +50,12 @@ def frame(
     scene in `words`. COUNT: how many pixels and taps there are, to record's counters. FILL: write them to record.
     scene: (h, w, C) bytes; only its size matters unless drawing. boxes: starts, widths, inverse distances (`boxes`).
     border, shift: how the scene goes on, and where the frame is in it. looks: grids, how many looks each has, how many of
-    the first look at four boxes each, bands of areas (`cap_tiles`), and area of a box over that of its part of a patch.
-    side, parts: rays of pixels at edges. nodes, caps, ...: see `cap_rays`, `cap_tiles`.
+    the first look at four boxes each, and bands of areas (`cap_tiles`).
+    sides, parts: rays of pixels at edges (`cap_edges`). nodes, caps, ...: see `cap_rays`, `cap_tiles`.
     record: pixels, caps' numbers, taps a pixel, clear shares, displacements, unknown; texels, weights; counters.
     """
     starts, pitches, inverses = boxes
-    grids, counts, fines, bands, wider = looks
+    grids, counts, fines, bands = looks
     height, width = out.shape[0], out.shape[1]
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
     rays, line = np.zeros(PLANES * 64, dtype=np.float32), np.zeros(15, dtype=np.float32)
@@ -91,14 +91,14 @@ def frame(
                         tile, t, s, not known, (low, high), following, cap, later, view, line, rays
                     )  # fmt: skip
                     known = low < high
-                    patches(rays, begin, end, bands, wider, shift, last)
+                    patches(rays, begin, end, bands, shift, last)
                     shares_of_row(tile, t, s, lanes, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
                         taken(tile, t, s, lanes, wide, caps, number, rivals, outline, line, rays)
                     if mode != DRAW:
                         record_row(
                             mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, tile, t, s, edge,
-                            caps, outlines, later, view, side, parts, (scene.shape[1], scene.shape[0]), starts, pitches,
+                            caps, outlines, later, view, sides, parts, (scene.shape[1], scene.shape[0]), starts, pitches,
                             inverses, border, shift, grids, counts, fines, rays, at, quarters, total, len(words), width,
                             record,
                         )  # fmt: skip
@@ -112,7 +112,7 @@ def frame(
                         )  # fmt: skip
                     edges_of_words(
                         words, scene, starts, pitches, inverses, last, shift, border, tile, t, s, u1, v, edge,
-                        hangs, tiny, caps, number, outlines, later, view, side, parts, low, high, rays, total, at,
+                        hangs, tiny, caps, number, outlines, later, view, sides, parts, low, high, rays, total, at,
                     )  # fmt: skip
                     write_bytes(out, v, u1, lanes, rays)
 
@@ -121,7 +121,7 @@ def frame(
 def record_row(
     filling: bool, u: Any, v: Any, number: Any, lanes: Any, low: Any, high: Any, begin: Any, end: Any, tiny: bool,
     hangs: bool, tile: Any, t: Any, s: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
-    side: Any, parts: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
+    sides: Any, parts: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
     counts: Any, fines: Any, rays: Any, at: Any, quarters: Any, mean: Any, boxes: Any, width: Any, record: Any,
 ) -> None:  # fmt: skip
     """Count, or write down, a row's pixels. u, v: column of lane 0, and row. boxes: how many there are."""
@@ -145,16 +145,18 @@ def record_row(
             off = not rays[FAR + j] >= ZERO
         elif has_own(rays, lane, low, high, tiny):
             rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
-            near = rival >= 0 or not rays[ROOM + j] > edge
+            near, form = rival >= 0 or not rays[ROOM + j] > edge, form_of(u + lane, v, outlines[number], tiny, rival)
+            count = sides[form, 0] * sides[form, 1]
             for which in (number, rival):
                 if which < 0:
                     continue
                 hidden += own_rays(
-                    tile, t, s + np.float32(lane), near, which, caps, number, rival, later, view, side, parts, rays
+                    tile, t, s + np.float32(lane), near, which, caps, number, rival, later, view, form, sides, parts,
+                    rays,
                 )  # fmt: skip
-                square, far = box_of_rays(rays, side, u + lane, v, outlines[which], last, shift)
+                square, far = box_of_rays(rays, count, u + lane, v, outlines[which], last, shift)
                 record_rays(
-                    starts, pitches, inverses, size, shift, border, rays, side, square, boxes, texels, weights,
+                    starts, pitches, inverses, size, shift, border, rays, count, square, boxes, texels, weights,
                     cursor, filling, mean,
                 )  # fmt: skip
                 off |= far

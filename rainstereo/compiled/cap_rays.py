@@ -27,8 +27,8 @@ HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))
 """Of a row: the share of each pixel that a cap hides; and 1 + the number of another that shows some of it, or 0."""
 SHOWN, CLEAR = np.uint64(64 * 45), np.uint64(64 * 48)
 """What a row shows, three channels a pixel, and the share that is clear, thrice."""
-WEIGHT = np.uint64(64 * 51)
-PLANES = 52
+WEIGHT, STRETCH = np.uint64(64 * 51), np.uint64(64 * 52)
+PLANES = 53
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
@@ -118,7 +118,8 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
     soft: each ray stands for light about it, over which the square of the wave vector's component along the normal
     behind the cap goes from `spread` below to as much above the ray's. That component is what places and gains depend
     on, nearly linearly, also where it ends, at the critical angle, and they as steeply as a square root: so its mean
-    gives the light's gain, and its mean weighted with itself the light's middle.
+    gives the light's gain, and its mean weighted with itself the light's middle. The plane `STRETCH` gets the component
+    before the cap's surface over that behind it.
     """
     square, depth, curvature = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH]), np.float32(cap[CAP_CURVATURE])
     n = np.float32(cap[CAP_INDEX])
@@ -151,6 +152,9 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
         px += s * kx
         py += s * ky
         up = kz + bend * (rise + depth)
+        if soft:
+            drawn_out = before / turned
+            rays[STRETCH + j] = drawn_out if turned > ZERO else ZERO
         rays[PX + j] = px
         rays[PY + j] = py
         rays[RISE + j] = rise

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from .cap_looks import INSIDE, OF_GRID, folded, look_at, places, sides, size_of
-from .cap_rays import HALF, HIDDEN, ONE, SUB, WEIGHT, Y_, ZERO
+from .cap_edges import WIDER as WIDER_RAY
+from .cap_edges import size_of_ray
+from .cap_looks import FINEST, INSIDE, OF_GRID, SMALLEST, folded, look_at, places, sides, size_of
+from .cap_rays import HALF, HIDDEN, ONE, STRETCH, SUB, WEIGHT, Y_, ZERO
 from .cap_tiles import FAR, GAINS, GRID, PART
 from .compile import compiled, inlined
 
@@ -72,13 +74,14 @@ def record_whole(
 
 @compiled
 def record_rays(
-    starts: Any, pitches: Any, inverses: Any, size: Any, shift: Any, border: Any, rays: Any, side: Any, square: Any,
+    starts: Any, pitches: Any, inverses: Any, size: Any, shift: Any, border: Any, rays: Any, number: Any, square: Any,
     first: Any, texels: Any, weights: Any, cursor: Any, filling: bool, mean: Any,
 ) -> None:  # fmt: skip
     """The taps of a pixel with rays of its own; adds the places of those that show something, and how many, to `mean`."""
     last = np.float32(size[0] - 1), np.float32(size[1] - 1)
-    level = size_of(square, len(inverses))
-    for j in range(np.uint64(side * side)):
+    fine = not square * WIDER_RAY >= FINEST
+    square *= WIDER_RAY * SMALLEST
+    for j in range(np.uint64(number)):
         weight = rays[WEIGHT + j]
         if not weight > ZERO:
             continue
@@ -86,9 +89,10 @@ def record_rays(
         mean[1] += rays[SUB + Y_ + j]
         mean[2] += ONE
         x, y = folded(rays[SUB + j] + shift[0], last[0], border), folded(rays[SUB + Y_ + j] + shift[1], last[1], border)
-        if level < 0:
+        if fine:
             _bilinear(texels, weights, cursor, filling, first, size, x, y, weight)
         else:
+            level = size_of_ray(square, rays[STRETCH + j], np.int32(len(inverses)))
             one = inverses[level]
             row, column = int(y * one + (HALF * one + HALF)), int(x * one + (HALF * one + HALF))
             _tap(texels, weights, cursor, filling, starts[level] + row * pitches[level] + column, weight)

@@ -48,8 +48,11 @@ CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, PART, GRID, FAR, LI
 """Planes of patches: the middle of what a pixel shows; how places change along x (A) and y (B), twice along each, and
 along both; mean gain; area, square pixels, that one look stands for; the number of the grid of looks; pixels between
 what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0."""
-AREAS, AIMS, FIRSTS = range(3)
-"""Columns of a table of bands: up to which area of a patch, how many looks it gets, and from which grid on."""
+AREAS, AIMS, FIRSTS, PARTS = range(4)
+"""Columns of a table of bands: up to which area of a patch, how many looks it gets, from which grid on, and
+which part of the patch's area a box has."""
+LARGEST = np.float32(90 * 90)
+"""Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
 
 
 @inlined
@@ -173,15 +176,16 @@ def reach(ax: Any, bx: Any, axx: Any, bxx: Any, mixed: Any) -> Any:
 
 
 @compiled
-def patches(rays: Any, low: Any, high: Any, bands: Any, wider: Any, shift: Any, last: Any) -> None:
+def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -> None:
     """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel.
 
-    bands: (4, 3), see `AREAS`. wider: area of a box over that of its part of the patch.
+    bands: (4, 4), see `AREAS`.
     """
     dx, dy, end_x, end_y = shift[0], shift[1], last[0], last[1]
     area1, area2, area3 = bands[0, AREAS], bands[1, AREAS], bands[2, AREAS]
     aim0, aim1, aim2, aim3 = bands[0, AIMS], bands[1, AIMS], bands[2, AIMS], bands[3, AIMS]
     first0, first1, first2, first3 = bands[0, FIRSTS], bands[1, FIRSTS], bands[2, FIRSTS], bands[3, FIRSTS]
+    part0, part1, part2, part3 = bands[0, PARTS], bands[1, PARTS], bands[2, PARTS], bands[3, PARTS]
     small, two, twelfth = np.float32(1 / 24), np.float32(2), np.float32(1 / 12)
     for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
         g, ag, bg, agg, bgg, _ = bent(rays, GAIN + j)
@@ -210,10 +214,11 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, wider: Any, shift: Any, 
         rays[ABY + j] = mixed
         rays[FAR + j] = far if far < p else p
         area = abs(ax * by - ay * bx)
-        aim, first = (aim0, first0) if area < area1 else (aim1, first1)
-        aim, first = (aim, first) if area < area2 else (aim2, first2)
-        aim, first = (aim, first) if area < area3 else (aim3, first3)
-        rays[PART + j] = wider * area / aim
+        aim, first, part = (aim0, first0, part0) if area < area1 else (aim1, first1, part1)
+        aim, first, part = (aim, first, part) if area < area2 else (aim2, first2, part2)
+        aim, first, part = (aim, first, part) if area < area3 else (aim3, first3, part3)
+        rays[PART + j] = area * part
+        rays[LITS + j] = rays[LITS + j] if area < LARGEST else PARTLY
         ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))
         across = np.float32(math.sqrt(aim * np.float32(math.sqrt(ratio)))) + HALF
         across = across if across < HALF * aim else HALF * aim

@@ -33,12 +33,13 @@ from .outlines import Outlines
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE = ((24.0, 8), (40.0, 16), (80.0, 25), (math.inf, 36)), 4
-COARSE = ((16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)), 3
+FINE = ((24.0, 8), (40.0, 16), (80.0, 25), (math.inf, 36)), ((8, 2), (2, 8), (4, 4))
+COARSE = ((16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)), ((4, 2), (2, 4), (3, 3))
 """Square root of the area, pixels, up to which what a pixel shows gets how many looks, the first of them at four boxes
-each; and rays along the side of a pixel at an edge."""
+each; and rays along and down a pixel at an edge, see `compiled.cap_edges`."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
-WIDER = 1.3  # area of a box over that of its part of what a pixel shows: a little overlap is best
+WIDER = 1.0, 1.3, 1.3, 1.3
+"""Area of a box over that of its part of what a pixel shows: a little overlap is best."""
 LANES = 64
 FEW = 400  # caps, up to which all pairs are compared
 
@@ -128,7 +129,7 @@ class CapScene:
         return Boxes.of(self.size)
 
     @property
-    def fineness(self) -> tuple[tuple[tuple[float, int], ...], int]:
+    def fineness(self) -> tuple[tuple[tuple[float, int], ...], tuple[tuple[int, int], ...]]:
         """`FINE` or `COARSE`."""
         return COARSE if self.tolerance >= COARSE_FROM else FINE
 
@@ -137,9 +138,9 @@ class CapScene:
         """Grids of looks and what says which a patch gets, see `compiled.cap_frames.frame`."""
         grids: list[Array] = []
         counts: list[int] = []
-        bands: list[tuple[float, int, int]] = []
-        for side, aim in self.fineness[0]:
-            bands.append((min(side * side, FAR), aim, len(counts) - 2))
+        bands: list[tuple[float, int, int, float]] = []
+        for (side, aim), wider in zip(self.fineness[0], WIDER, strict=True):
+            bands.append((min(side * side, FAR), aim, len(counts) - 2, wider / aim))
             for across in range(2, aim // 2 + 1):
                 down = max(aim // across, 2)
                 s, t = (part.ravel() for part in np.meshgrid(_middles(across), _middles(down)))
@@ -147,17 +148,17 @@ class CapScene:
                 grids.append(np.zeros((5, LANES), dtype=np.float32))
                 grids[-1][:, : len(s)] = s, t, s * s / 2, t * t / 2, s * t
         table = np.array(bands, dtype=np.float32)
-        return np.concatenate(grids).ravel(), np.array(counts), int(bands[1][2] + 2), table, np.float32(WIDER)
+        return np.concatenate(grids).ravel(), np.array(counts), int(bands[1][2] + 2), table
 
     @cached_property
-    def parts(self) -> tuple[int, Array]:
-        """Rays along a pixel's side; places of them, and 1 for each."""
-        side = self.fineness[1]
-        row, column = np.divmod(np.arange(side * side), side)
-        table: Array = np.zeros((3, LANES), dtype=np.float32)
-        middles = _middles(side)
-        table[:, : side * side] = middles[column], middles[row], np.ones(side * side)
-        return side, table.ravel()
+    def parts(self) -> tuple[Indices, Array]:
+        """Rays along and down a pixel; places of them, and 1 for each."""
+        sides = np.array(self.fineness[1], dtype=np.int64)
+        table: Array = np.zeros((len(sides), 3, LANES), dtype=np.float32)
+        for form, (across, down) in zip(table, sides, strict=True):
+            x, y = np.meshgrid(_middles(across), _middles(down))
+            form[:, : x.size] = x.ravel(), y.ravel(), np.ones(x.size)
+        return sides, table.ravel()
 
     def go(self, mode: int, out: Any, scene: Any, words: Any, caps: CapTable, record: Any) -> None:
         """Run the loops over caps, see `compiled.cap_frames.frame`."""
