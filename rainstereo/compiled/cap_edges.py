@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .boxes import FIELD, FIRST, TWICE
-from .cap_looks import FINEST, INSIDE, ONE_, SCALE, SMALLEST, TWO_, folded, pixel_value
+from .cap_looks import BIAS, FINEST, INSIDE, ONE_, SCALE, SMALLEST, TWO_, folded, pixel_value
 from .cap_rays import (
     CAP_CURVATURE,
     CAP_DEPTH,
@@ -43,7 +43,7 @@ from .cap_rays import (
 )
 from .cap_shares import contact_share, from_rival
 from .cap_tiles import LITS, WHOLE, along, down, value_on
-from .compile import compiled, inlined
+from .compile import fused, fused_part
 from .prefetch import to_read
 
 WIDER = np.float32(1.6)
@@ -52,7 +52,7 @@ STEEP = 1.73
 SOFTEST = np.float32(1e-3)  # less is lost in rounding
 
 
-@inlined
+@fused_part
 def has_own(rays: Any, lane: Any, low: Any, high: Any, tiny: bool) -> Any:
     """Whether a pixel has rays of its own; low, high: between which lanes rays have been traced."""
     j = np.uint64(lane)
@@ -61,7 +61,7 @@ def has_own(rays: Any, lane: Any, low: Any, high: Any, tiny: bool) -> Any:
     return tiny or rays[RIVAL + j] > ZERO or ZERO < rays[LITS + j] < WHOLE
 
 
-@compiled
+@fused
 def own_rays(
     tile: Any, t: Any, s: Any, near: bool, which: Any, caps: Any, number: Any, rival: Any, later: Any,
     view: Any, form: Any, sides: Any, parts: Any, rays: Any,
@@ -118,7 +118,7 @@ def own_rays(
     return total * part
 
 
-@inlined
+@fused_part
 def form_of(u: Any, v: Any, outline: Any, tiny: bool, rival: Any) -> Any:
     """How the rays of a pixel at u, v are spread: more along its rows or down its columns, whichever is towards the
     cap's middle, or 2: as many, where neither is or other caps are there."""
@@ -128,7 +128,7 @@ def form_of(u: Any, v: Any, outline: Any, tiny: bool, rival: Any) -> Any:
     return 0 if dx > STEEP * dy else 1 if dy > STEEP * dx else 2
 
 
-@inlined
+@fused_part
 def softness(cap: Any, px: Any, py: Any, kx: Any, ky: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
     """Half of how much the square of the wave vector's component along a cap's normal changes over a part of a pixel."""
     q, curvature, depth = np.float32(cap[CAP_INDEX] ** 2), np.float32(cap[CAP_CURVATURE]), np.float32(cap[CAP_DEPTH])
@@ -137,7 +137,7 @@ def softness(cap: Any, px: Any, py: Any, kx: Any, ky: Any, xu: Any, xv: Any, yu:
     return curvature * curvature * np.float32(math.sqrt(gu * gu + gv * gv))
 
 
-@compiled
+@fused
 def box_of_rays(rays: Any, number: Any, u: Any, v: Any, outline: Any, last: Any, shift: Any) -> Any:
     """The area that the part of a pixel of each of its rays spans, if it is as wide as about the middle of a cap; and
     whether some look beyond the scene. number: of rays. u, v: the pixel. outline: of the cap."""
@@ -158,7 +158,7 @@ def box_of_rays(rays: Any, number: Any, u: Any, v: Any, outline: Any, last: Any,
     return (gx * gx + gy * gy) / max(dx * dx + dy * dy, ONE) / np.float32(number), far
 
 
-@inlined
+@fused_part
 def size_of_ray(square: Any, stretch: Any, sizes: Any) -> Any:
     """The size of the box of a ray; square: see `box_of_rays`."""
     longer = stretch + stretch - np.float32(2)
@@ -168,7 +168,7 @@ def size_of_ray(square: Any, stretch: Any, sizes: Any) -> Any:
     return size if size < sizes - 1 else sizes - 1
 
 
-@inlined
+@fused_part
 def boxes_of_rays(
     starts: Any, pitches: Any, inverses: Any, square: Any, last: Any, shift: Any, border: Any, rays: Any, number: Any,
     at: Any,
@@ -186,7 +186,7 @@ def boxes_of_rays(
         at[j] = np.uint32(starts[size] + np.int64(np.int32(y * one + middle)) * pitches[size] + np.int32(x * one + middle))
 
 
-@compiled
+@fused
 def rays_of_words(
     words: Any, scene: Any, starts: Any, pitches: Any, inverses: Any, last: Any, shift: Any, border: Any,
     rays: Any, number: Any, square: Any, far: bool, at: Any, total: Any,
@@ -207,18 +207,19 @@ def rays_of_words(
         boxes_of_rays(starts, pitches, inverses, square, last, shift, INSIDE, rays, number, at)
     for j in range(count):
         to_read(words, np.uint64(at[j]))
-    red, green, blue = ZERO, ZERO, ZERO
+    red, green, blue, all_ = ZERO, ZERO, ZERO, ZERO
     for j in range(count):
         weight, word = rays[WEIGHT + j], words[np.uint64(at[j])]
+        all_ += weight
         red += weight * np.float32(np.int32(word & FIRST))
         green += weight * np.float32(np.int32((word >> FIELD) & FIRST))
         blue += weight * np.float32(np.int32(word >> TWICE))
-    total[0] += red * SCALE
-    total[1] += green * SCALE
-    total[2] += blue * SCALE
+    total[0] += red * SCALE - all_ * BIAS
+    total[1] += green * SCALE - all_ * BIAS
+    total[2] += blue * SCALE - all_ * BIAS
 
 
-@compiled
+@fused
 def edges_of_words(
     words: Any, scene: Any, starts: Any, pitches: Any, inverses: Any, last: Any, shift: Any, border: Any,
     tile: Any, t: Any, s: Any, u: Any, v: Any, edge: Any, hangs: bool, tiny: bool, caps: Any, number: Any,

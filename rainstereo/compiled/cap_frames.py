@@ -32,13 +32,13 @@ from .cap_tiles import (
     row_of_tile,
     widest,
 )  # fmt: skip
-from .compile import compiled
+from .compile import fused
 from .layout import DRAW, FILL
 
 WHITE = np.float32(255)
 
 
-@compiled
+@fused
 def frame(
     mode: Any, out: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, looks: Any,
     sides: Any, parts: Any, nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
@@ -117,7 +117,7 @@ def frame(
                     write_bytes(out, v, u1, lanes, rays)
 
 
-@compiled
+@fused
 def record_row(
     filling: bool, u: Any, v: Any, number: Any, lanes: Any, low: Any, high: Any, begin: Any, end: Any, tiny: bool,
     hangs: bool, tile: Any, t: Any, s: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
@@ -173,7 +173,7 @@ def record_row(
         cursor[PIXELS] += 1
 
 
-@compiled
+@fused
 def write_bytes(out: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
     """Mix what a row shows with what is there, where a cap hides it."""
     channels = np.uint64(out.shape[2])

@@ -34,10 +34,11 @@ from .cap_tiles import (
     WHOLE,
 )  # fmt: skip
 from .boxes import channels_of, spread
-from .compile import compiled, inlined
+from .compile import fused, fused_part
 from .prefetch import to_read
 
-SCALE = np.float32(1 / 4)  # of words
+SCALE, BIAS = np.float32(1 / 4), np.float32(0.125)  # of words
+"""What makes gray levels of words; and by how much these are too large, from rounding up when halving the image."""
 MIRROR, EDGE, INSIDE = 0, 1, 2
 """How the scene goes on beyond its edges; or that nothing lies beyond them."""
 FINEST = np.float32(4)
@@ -55,7 +56,7 @@ ONE_, TWO_ = np.uint64(1), np.uint64(2)
 TWO, THREE, FOURTH = np.int32(2), np.int32(3), np.int32(4)
 
 
-@inlined
+@fused_part
 def folded(at: Any, last: Any, border: Any) -> Any:
     """A coordinate brought between 0 and `last`, as `patch.folded_along` does."""
     if border == MIRROR:
@@ -68,7 +69,7 @@ def folded(at: Any, last: Any, border: Any) -> Any:
     return at if at < last else last
 
 
-@inlined
+@fused_part
 def size_of(square: Any, sizes: Any) -> Any:
     """The size of boxes for a part of a patch, of this area; -1: the image itself."""
     if not square >= FINEST:
@@ -77,7 +78,7 @@ def size_of(square: Any, sizes: Any) -> Any:
     return max(min(octaves, sizes - 1), 0)
 
 
-@inlined
+@fused_part
 def pixel_value(scene: Any, x: Any, y: Any, channel: Any) -> Any:
     """An image's value, bilinear, at a place inside it."""
     i, j = int(y), int(x)
@@ -88,7 +89,7 @@ def pixel_value(scene: Any, x: Any, y: Any, channel: Any) -> Any:
     return top * (ONE - v) + bottom * v
 
 
-@inlined
+@fused_part
 def place_on(rays: Any, j: Any, s: Any, t: Any) -> Any:
     """Where a place on a pixel, -1/2 to 1/2 each way, looks."""
     x = rays[CX + j] + s * (rays[AX + j] + HALF * s * rays[AXX + j] + t * rays[ABX + j])
@@ -96,7 +97,7 @@ def place_on(rays: Any, j: Any, s: Any, t: Any) -> Any:
     return x + t * (rays[BX + j] + HALF * t * rays[BXX + j]), y + t * (rays[BY + j] + HALF * t * rays[BYY + j])
 
 
-@inlined
+@fused_part
 def sides(rays: Any, j: Any) -> Any:
     """Looks along a patch of a few pixels, across and down: some two pixels apart."""
     ax, ay, bx, by = rays[AX + j], rays[AY + j], rays[BX + j], rays[BY + j]
@@ -105,7 +106,7 @@ def sides(rays: Any, j: Any) -> Any:
     return across, down
 
 
-@inlined
+@fused_part
 def look_at(rays: Any, j: Any, a: Any, b: Any, across: Any, down: Any, last: Any, border: Any) -> Any:
     """Where look a, b of those along a patch of a few pixels falls in the image."""
     s, t = (np.float32(a) + HALF) / np.float32(across) - HALF, (np.float32(b) + HALF) / np.float32(down) - HALF
@@ -113,7 +114,7 @@ def look_at(rays: Any, j: Any, a: Any, b: Any, across: Any, down: Any, last: Any
     return folded(x, last[0], border), folded(y, last[1], border)
 
 
-@compiled
+@fused
 def patch_of_pixels(scene: Any, last: Any, border: Any, rays: Any, j: Any, total: Any) -> None:
     """The mean of a patch of a few pixels, from the image itself; added to `total`, (C,)."""
     across, down = sides(rays, j)
@@ -125,7 +126,7 @@ def patch_of_pixels(scene: Any, last: Any, border: Any, rays: Any, j: Any, total
                 total[channel] += part * pixel_value(scene, x, y, channel)
 
 
-@inlined
+@fused_part
 def places(
     fine: bool, start: Any, pitch: Any, inverse: Any, last: Any, border: Any, rays: Any, j: Any, grids: Any,
     grid: Any, count: Any, at: Any, first: Any, parts: Any,
@@ -155,7 +156,7 @@ def places(
             at[first + look] = np.uint32(number + row * line + column)
 
 
-@inlined
+@fused_part
 def sum_of(words: Any, at: Any, first: Any, count: Any) -> Any:
     """Of some boxes."""
     found = np.uint64(0)
@@ -164,7 +165,7 @@ def sum_of(words: Any, at: Any, first: Any, count: Any) -> Any:
     return found
 
 
-@inlined
+@fused_part
 def sum_of_means(words: Any, pitch: Any, at: Any, parts: Any, first: Any, count: Any) -> Any:
     """Of bilinear means of four boxes each, 16 times as large."""
     found, line = np.uint64(0), np.uint64(pitch)
@@ -179,21 +180,21 @@ def sum_of_means(words: Any, pitch: Any, at: Any, parts: Any, first: Any, count:
     return found
 
 
-@inlined
-def show(rays: Any, j: Any, found: Any, gain: Any) -> None:
-    """Write what a pixel shows: a sum of words."""
+@fused_part
+def show(rays: Any, j: Any, found: Any, gain: Any, less: Any) -> None:
+    """Write what a pixel shows: a sum of words. gain: of its unit; less: `BIAS` in that unit."""
     k = SHOWN + j + j + j
     one, two, three = channels_of(found)
-    rays[k], rays[k + ONE_], rays[k + TWO_] = gain * one, gain * two, gain * three
+    rays[k], rays[k + ONE_], rays[k + TWO_] = gain * (one - less), gain * (two - less), gain * (three - less)
 
 
-@inlined
+@fused_part
 def is_whole(rays: Any, j: Any) -> Any:
     """Whether a pixel is shown as a patch."""
     return rays[HIDDEN + j] > ZERO and rays[LITS + j] == WHOLE and not rays[RIVAL + j] > ZERO
 
 
-@compiled
+@fused
 def whole_of_words(
     words: Any, scene: Any, starts: Any, pitches: Any, inverses: Any, last: Any, border: Any,
     grids: Any, counts: Any, fines: Any, low: Any, high: Any, rays: Any, total: Any, at: Any, parts: Any, slots: Any,
@@ -242,9 +243,6 @@ def whole_of_words(
             made += 1
         for i in range(np.uint64(made)):
             j, count, pitch = np.uint64(slots[np.uint64(0), i]), slots[ONE_, i], slots[TWO_, i]
-            gain = rays[GAINS + j] * rays[HIDDEN + j] * SCALE / np.float32(count)
-            if pitch:
-                found = sum_of_means(words, pitch, at, parts, np.uint64(64) * i, count)
-                show(rays, j, found, gain * np.float32(1 / 16))
-            else:
-                show(rays, j, sum_of(words, at, np.uint64(64) * i, count), gain)
+            unit = SCALE / np.float32(16 * count) if pitch else SCALE / np.float32(count)
+            found = sum_of_means(words, pitch, at, parts, np.uint64(64) * i, count) if pitch else sum_of(words, at, np.uint64(64) * i, count)
+            show(rays, j, found, rays[GAINS + j] * rays[HIDDEN + j] * unit, BIAS / unit)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .compile import inlined
+from .compile import fused_part
 
 PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
 OWN, SIDES, ABOVE, BELOW = (np.uint64(64 * i) for i in (11, 14, 17, 20))
@@ -46,7 +46,7 @@ STEP = 8  # pixels between nodes
 X_NODE, Y_NODE, KX_NODE, KY_NODE, DIM_NODE = range(5)
 
 
-@inlined
+@fused_part
 def fit(nodes: Any, cap: Any, u: Any, v: Any, reach: Any, tile: Any) -> Any:
     """Polynomials of x, y, kx, ky and dimming over a tile, (5, 3, 3) float32, and the pixel that they are about.
 
@@ -76,7 +76,7 @@ def fit(nodes: Any, cap: Any, u: Any, v: Any, reach: Any, tile: Any) -> Any:
     return np.float32(i * STEP), np.float32(j * STEP)
 
 
-@inlined
+@fused_part
 def of_row(tile: Any, t: Any, line: Any) -> None:
     """The polynomials, (15,), of a row, t pixels from that which a tile's are about."""
     for plane in range(5):
@@ -84,7 +84,7 @@ def of_row(tile: Any, t: Any, line: Any) -> None:
             line[3 * plane + power] = tile[plane, 0, power] + t * (tile[plane, 1, power] + t * tile[plane, 2, power])
 
 
-@inlined
+@fused_part
 def take_up(line: Any, s: Any, low: Any, high: Any, rays: Any) -> None:
     """Rays of lanes low to before high, s + lane pixels along a row."""
     x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
@@ -99,7 +99,7 @@ def take_up(line: Any, s: Any, low: Any, high: Any, rays: Any) -> None:
         rays[DIM + j] = d0 + at * (d1 + at * d2)
 
 
-@inlined
+@fused_part
 def room_of_row(line: Any, s: Any, lanes: Any, square: Any, rays: Any) -> None:
     """Contact radius squared less the square of the distance from the centre, of a row's rays on the face."""
     x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
@@ -109,7 +109,7 @@ def room_of_row(line: Any, s: Any, lanes: Any, square: Any, rays: Any) -> None:
         rays[NEXT + j] = square - x * x - y * y
 
 
-@inlined
+@fused_part
 def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: Any, soft: bool, spread: Any) -> None:
     """Rays that have been taken up, through the cap, the rest of the chamber and to the scene; written from `to` on.
 
@@ -182,7 +182,7 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
     _project(np.float32(cap[CAP_X]), np.float32(cap[CAP_Y]), view, rays, first, last, to)
 
 
-@inlined
+@fused_part
 def _project(cx: Any, cy: Any, view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
     """Where the camera sees what the rays meet at the scene's depth."""
     m0, m1, m2, m3, m4, m5, m6, m7, m8 = view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8]
@@ -204,7 +204,7 @@ def _project(cx: Any, cy: Any, view: Any, rays: Any, first: Any, last: Any, to: 
         _distort(view, rays, first, last, to)
 
 
-@inlined
+@fused_part
 def _distort(view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
     """The lens's distortion of places; what lies beyond the radius where it folds back goes to that radius."""
     u0, v0, fold = view[VIEW_C], view[VIEW_C + 1], view[VIEW_FOLD]

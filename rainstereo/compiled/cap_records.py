@@ -11,12 +11,12 @@ from .cap_edges import size_of_ray
 from .cap_looks import FINEST, INSIDE, OF_GRID, SMALLEST, folded, look_at, places, sides, size_of
 from .cap_rays import HALF, HIDDEN, ONE, STRETCH, SUB, WEIGHT, Y_, ZERO
 from .cap_tiles import FAR, GAINS, GRID, PART
-from .compile import compiled, inlined
+from .compile import fused, fused_part
 
 PIXELS, TAPS = 0, 1  # counters
 
 
-@inlined
+@fused_part
 def _tap(texels: Any, weights: Any, cursor: Any, filling: bool, texel: Any, weight: Any) -> None:
     if filling:
         texels[cursor[TAPS]] = texel
@@ -24,7 +24,7 @@ def _tap(texels: Any, weights: Any, cursor: Any, filling: bool, texel: Any, weig
     cursor[TAPS] += 1
 
 
-@inlined
+@fused_part
 def _bilinear(
     texels: Any, weights: Any, cursor: Any, filling: bool, first: Any, size: Any, x: Any, y: Any,
     weight: Any,
@@ -38,7 +38,7 @@ def _bilinear(
             _tap(texels, weights, cursor, filling, first + row * size[0] + column, weight * a * b)
 
 
-@compiled
+@fused
 def record_whole(
     starts: Any, pitches: Any, inverses: Any, size: Any, border: Any, grids: Any, counts: Any, fines: Any, rays: Any,
     lane: Any, first: Any, at: Any, parts: Any, texels: Any, weights: Any, cursor: Any, filling: bool,
@@ -72,7 +72,7 @@ def record_whole(
         _tap(texels, weights, cursor, filling, np.int64(at[look]), part)
 
 
-@compiled
+@fused
 def record_rays(
     starts: Any, pitches: Any, inverses: Any, size: Any, shift: Any, border: Any, rays: Any, number: Any, square: Any,
     first: Any, texels: Any, weights: Any, cursor: Any, filling: bool, mean: Any,

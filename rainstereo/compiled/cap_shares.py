@@ -31,13 +31,13 @@ from .cap_rays import (
     take_up,
 )
 from .cap_tiles import OUT_RIVAL, OUT_RIVALS, along, down, value_on
-from .compile import compiled, inlined
+from .compile import fused, fused_part
 
 SIDE = 4  # samples along a pixel's side where a cap hangs over
 ALIKE = 1e-6  # of a cap's room: less of a difference is rounding
 
 
-@inlined
+@fused_part
 def beside_line(g: Any, h: Any, beyond: Any) -> Any:
     """Share of a unit square on one side of a line; g, h: how what grows across the line changes along and down the
     square; beyond: how much of it the line lies beyond the square's middle."""
@@ -54,7 +54,7 @@ def beside_line(g: Any, h: Any, beyond: Any) -> Any:
     return HALF + distance / a if far <= HALF * (a - b) else corner
 
 
-@inlined
+@fused_part
 def contact_share(px: Any, py: Any, radius: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
     """Share of a pixel inside the contact circle; xu, ...: metres on the face a pixel."""
     r = np.float32(math.sqrt(px * px + py * py))
@@ -62,7 +62,7 @@ def contact_share(px: Any, py: Any, radius: Any, xu: Any, xv: Any, yu: Any, yv: 
     return share if r > np.float32(1e-3) * radius else ONE
 
 
-@compiled
+@fused
 def side_share(px: Any, py: Any, kx: Any, ky: Any, radius: Any, depth: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
     """Share of a pixel that a cap hides by its base or by its side, which rays beside it meet from the air."""
     kz = np.float32(math.sqrt(max(ONE - kx * kx - ky * ky, ZERO)))
@@ -92,7 +92,7 @@ def side_share(px: Any, py: Any, kx: Any, ky: Any, radius: Any, depth: Any, xu: 
     return total / np.float32(SIDE * SIDE)
 
 
-@inlined
+@fused_part
 def contacts(tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, line: Any, rays: Any) -> None:
     """Fill the plane `HIDDEN` from low to before high with shares inside the contact circle; line: of the row."""
     radius, two = np.float32(math.sqrt(cap[CAP_SQUARE])), t + t
@@ -110,7 +110,7 @@ def contacts(tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, line: Any
         rays[HIDDEN + j] = share if share > ZERO else ZERO
 
 
-@compiled
+@fused
 def shares_of_row(
     tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, hangs: bool, cap: Any,
     line: Any, rays: Any,
@@ -145,7 +145,7 @@ def shares_of_row(
         _by_sides(tile, t, s, lanes, edge, wide, cap, line, rays)
 
 
-@compiled
+@fused
 def _by_sides(tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, cap: Any, line: Any, rays: Any) -> None:
     """Add what a cap that hangs over hides by its side."""
     take_up(line, s, 0, (lanes + 7) // 8 * 8, rays)
@@ -169,7 +169,7 @@ def _by_sides(tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, cap: 
 # -- caps that overlap -------------------------------------------------------------------------------------------------
 
 
-@compiled
+@fused
 def taken(
     tile: Any, t: Any, s: Any, lanes: Any, wide: Any, caps: Any, number: Any, rivals: Any, outline: Any, line: Any,
     rays: Any,
@@ -202,7 +202,7 @@ def taken(
                 rays[RIVAL + j] = name
 
 
-@inlined
+@fused_part
 def from_rival(caps: Any, number: Any, other: Any) -> Any:
     """Where another cap is, from a cap's centre, and how much more room it needs to have a place."""
     dx, dy = np.float32(caps[other, CAP_X] - caps[number, CAP_X]), np.float32(caps[other, CAP_Y] - caps[number, CAP_Y])
@@ -211,7 +211,7 @@ def from_rival(caps: Any, number: Any, other: Any) -> Any:
     return dx, dy, need + (-alike if _comes_before(caps, other, number) else alike)
 
 
-@inlined
+@fused_part
 def _comes_before(caps: Any, one: Any, other: Any) -> Any:
     """Which of two caps has what both have as much room for, whatever their order; of equal ones the first."""
     before = one < other

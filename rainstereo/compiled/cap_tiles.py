@@ -33,7 +33,7 @@ from .cap_rays import (
     room_of_row,
     take_up,
 )  # fmt: skip
-from .compile import compiled, inlined
+from .compile import fused, fused_part
 
 TILE = 56  # pixels along a side, at most
 TINY = 2.5
@@ -55,7 +55,7 @@ LARGEST = np.float32(90 * 90)
 """Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
 
 
-@inlined
+@fused_part
 def bounds(outline: Any, width: Any, height: Any) -> Any:
     """Columns and rows of the image, firsts and those after the last, that an outline touches."""
     x, y, reach = outline[OUT_X], outline[OUT_Y], min(outline[OUT_RADIUS], 1e9)
@@ -66,7 +66,7 @@ def bounds(outline: Any, width: Any, height: Any) -> Any:
     return left, right, top, bottom
 
 
-@inlined
+@fused_part
 def widest(tile: Any) -> Any:
     """How far apart rays that are a pixel apart meet the face, metres, at most: the larger singular value."""
     xu, xv, yu, yv = tile[0, 0, 1], tile[0, 1, 0], tile[1, 0, 1], tile[1, 1, 0]
@@ -74,7 +74,7 @@ def widest(tile: Any) -> Any:
     return 1.02 * math.sqrt(0.5 * (total + math.sqrt(max(total * total - area * area, 0.0))))
 
 
-@inlined
+@fused_part
 def hangs_over(tile: Any, cap: Any, wide: Any, reach: Any) -> Any:
     """Whether rays beside a cap may run into its side."""
     kx = abs(tile[2, 0, 0]) + reach * (abs(tile[2, 0, 1]) + abs(tile[2, 1, 0]))
@@ -84,7 +84,7 @@ def hangs_over(tile: Any, cap: Any, wide: Any, reach: Any) -> Any:
     return math.sqrt(square) * out > math.sqrt(max(1 - square, 0.0)) * cap[CAP_DEPTH]
 
 
-@compiled
+@fused
 def next_span(tile: Any, t: Any, s: Any, lanes: Any, cap: Any, slack: Any, line: Any, rays: Any) -> Any:
     """Fill the plane of room of a row, and say between which lanes its rays meet the contact circle, or nearly."""
     of_row(tile, t, line)
@@ -97,7 +97,7 @@ def next_span(tile: Any, t: Any, s: Any, lanes: Any, cap: Any, slack: Any, line:
     return low, high
 
 
-@compiled
+@fused
 def trace_lanes(
     tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, later: Any, view: Any, line: Any,
     rays: Any, to: Any,
@@ -109,7 +109,7 @@ def trace_lanes(
     cross(cap, later, view, rays, low, end, to, False, ONE)
 
 
-@compiled
+@fused
 def row_of_tile(
     tile: Any, t: Any, s: Any, is_first: bool, span: Any, following: Any, cap: Any,
     later: Any, view: Any, line: Any, rays: Any,
@@ -141,7 +141,7 @@ def row_of_tile(
     return low, high
 
 
-@inlined
+@fused_part
 def lit(rays: Any, low: Any, high: Any) -> None:
     """Fill the plane `LITS` from low to before high."""
     one = np.uint64(1)
@@ -155,7 +155,7 @@ def lit(rays: Any, low: Any, high: Any) -> None:
         rays[LITS + j] = WHOLE if least > ZERO else PARTLY if most > ZERO else ZERO
 
 
-@inlined
+@fused_part
 def bent(rays: Any, j: Any) -> Any:
     """What rays have of a pixel, as a quadratic in the place on it: `CX`, `AX`, `BX`, `AXX`, `BXX`, `ABX`. j: of the
     lane, among x, y or gains."""
@@ -169,13 +169,13 @@ def bent(rays: Any, j: Any) -> Any:
     return c, ax, bx, axx, bxx + bxx, mixed
 
 
-@inlined
+@fused_part
 def reach(ax: Any, bx: Any, axx: Any, bxx: Any, mixed: Any) -> Any:
     """How far from its middle's what a pixel shows goes, at most."""
     return HALF * (abs(ax) + abs(bx)) + np.float32(0.125) * (abs(axx) + abs(bxx)) + np.float32(0.25) * abs(mixed)
 
 
-@compiled
+@fused
 def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -> None:
     """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel.
 
@@ -225,7 +225,7 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -
         rays[GRID + j] = first + (across if across > two else two)
 
 
-@compiled
+@fused
 def move_up(rays: Any) -> None:
     """What was below a row is above the next, and what was next to come is at hand."""
     for j in range(np.uint64(3 * 64)):
@@ -234,7 +234,7 @@ def move_up(rays: Any) -> None:
         rays[ROOM + j] = rays[NEXT + j]
 
 
-@inlined
+@fused_part
 def value_on(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     """A tile's polynomial, t and s pixels from its own."""
     a = tile[plane, 0, 0] + t * (tile[plane, 1, 0] + t * tile[plane, 2, 0])
@@ -243,7 +243,7 @@ def value_on(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     return a + s * (b + s * c)
 
 
-@inlined
+@fused_part
 def along(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     """How it changes a pixel along a row."""
     b = tile[plane, 0, 1] + t * (tile[plane, 1, 1] + t * tile[plane, 2, 1])
@@ -251,7 +251,7 @@ def along(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     return b + (s + s) * c
 
 
-@inlined
+@fused_part
 def down(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     """How it changes a pixel down."""
     b = tile[plane, 1, 0] + s * (tile[plane, 1, 1] + s * tile[plane, 1, 2])

@@ -33,12 +33,12 @@ from .outlines import Outlines
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE = ((24.0, 8), (40.0, 16), (80.0, 25), (math.inf, 36)), ((8, 2), (2, 8), (4, 4))
+FINE = ((20.0, 8), (24.0, 12), (64.0, 20), (math.inf, 36)), ((8, 2), (2, 8), (4, 4))
 COARSE = ((16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)), ((4, 2), (2, 4), (3, 3))
 """Square root of the area, pixels, up to which what a pixel shows gets how many looks, the first of them at four boxes
 each; and rays along and down a pixel at an edge, see `compiled.cap_edges`."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
-WIDER = 1.0, 1.3, 1.3, 1.3
+WIDER = 1.4, 1.25, 1.25, 1.25
 """Area of a box over that of its part of what a pixel shows: a little overlap is best."""
 LANES = 64
 FEW = 400  # caps, up to which all pairs are compared
