@@ -1,8 +1,8 @@
 """Means over squares of an image that overlap, so that the nearest one to any place is nearly centred there.
 
 Box j of a size along an axis is centred on the edge between the pixels t j - 1 and t j, t the pixels between them; beyond
-the image's edges it goes on mirrored, to about a pixel. Three channels of bytes stand in a word of 32 bits, four times as
-large: small words are read sooner. A size between two others is the mean of both: the square of its width is theirs'.
+the image's edges it goes on mirrored, to about a pixel. Three channels of bytes stand in a word of 32 bits, 10 bits
+apart, so that four can be added: small words are read sooner. A size between two others is the mean of both: the square of its width is theirs'.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ WIDE = 20
 """Bits of a channel in a word that has been spread: 0 up, the last channel's from 20 and the middle one's from 40 on."""
 TO_WIDE = np.uint64(2 * WIDE - BITS)
 EVEN = np.uint32(0x3FFFFFFF & ~((1 << 2 * BITS) + (1 << BITS) + 1))  # all but the last bit of each channel
+LAST = np.uint32((1 << 2 * BITS) + (1 << BITS) + 1)
 ONE, SHIFT = np.uint64(1), np.uint32(1)
 
 
@@ -63,19 +64,6 @@ def mirrored(j: Any, last: Any) -> Any:
     return max(j, 0)
 
 
-@compiled
-def first_boxes(cells: Any, boxes: Any) -> None:
-    """Boxes of four pixels, (h + 1, w + 1), from means over 2 x 2, (h, w)."""
-    height, width = cells.shape
-    for j in range(height + 1):
-        one, other, out = cells[max(j - 1, 0)], cells[min(j, height - 1)], boxes[j]
-        for i in (0, width):
-            a, b = np.uint64(max(i - 1, 0)), np.uint64(min(i, width - 1))
-            out[np.uint64(i)] = (one[a] + one[b]) + (other[a] + other[b])
-        for i in range(ONE, np.uint64(width)):
-            out[i] = (one[i - ONE] + one[i]) + (other[i - ONE] + other[i])
-
-
 @inlined
 def _lower(a: Any, b: Any) -> Any:
     """The mean of two words, channel by channel, rounded down."""
@@ -89,8 +77,27 @@ def _upper(a: Any, b: Any) -> Any:
 
 
 @inlined
+def _either(a: Any, b: Any, up: Any) -> Any:
+    """The same, rounded up in the bits of `up`."""
+    return _lower(a, b) + ((a ^ b) & up)
+
+
+@inlined
 def _mean(a: Any, b: Any, c: Any, d: Any) -> Any:
     return _upper(_lower(a, b), _lower(c, d))  # too large as often as too small
+
+
+@compiled
+def first_boxes(cells: Any, boxes: Any) -> None:
+    """Boxes of four pixels, (h + 1, w + 1), from means over 2 x 2, (h, w)."""
+    height, width = cells.shape
+    for j in range(height + 1):
+        one, other, out = cells[max(j - 1, 0)], cells[min(j, height - 1)], boxes[j]
+        for i in (0, width):
+            a, b = np.uint64(max(i - 1, 0)), np.uint64(min(i, width - 1))
+            out[np.uint64(i)] = _mean(one[a], one[b], other[a], other[b])
+        for i in range(ONE, np.uint64(width)):
+            out[i] = _mean(one[i - ONE], one[i], other[i - ONE], other[i])
 
 
 @compiled
@@ -108,20 +115,21 @@ def next_boxes(boxes: Any, apart: Any, step: Any, between: Any, larger: Any) -> 
     for j in range(height):
         one, other = boxes[mirrored(step * j - apart, down)], boxes[mirrored(step * j + apart, down)]
         own, middle, out = boxes[mirrored(step * j, down)], between[j], larger[j]
+        up = LAST if j % 2 else np.uint32(0)  # halves are rounded up in every second row
         for part in ((0, first), (stop, width)):
             for i in range(part[0], part[1]):
                 at = step * i
                 a, b = np.uint64(mirrored(at - apart, across)), np.uint64(mirrored(at + apart, across))
                 out[np.uint64(i)] = _mean(one[a], one[b], other[a], other[b])
-                middle[np.uint64(i)] = _lower(own[np.uint64(mirrored(at, across))], out[np.uint64(i)])
+                middle[np.uint64(i)] = _either(own[np.uint64(mirrored(at, across))], out[np.uint64(i)], up)
         if step == 1:
             for i in range(np.uint64(first), wide):
                 mean = _mean(one[i - far], one[i + far], other[i - far], other[i + far])
                 out[i] = mean
-                middle[i] = _lower(own[i], mean)
+                middle[i] = _either(own[i], mean, up)
         else:
             for i in range(np.uint64(first), wide):
                 at = i + i
                 mean = _mean(one[at - far], one[at + far], other[at - far], other[at + far])
                 out[i] = mean
-                middle[i] = _lower(own[at], mean)
+                middle[i] = _either(own[at], mean, up)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .cap_edges import box_of_rays, edges_of_words, form_of, has_own, own_rays
+from .cap_edges import boxes_of_rays, edges_of_words, form_of, has_own, own_rays, slopes_of_row, spread_rays
 from .cap_looks import ROUND, is_whole, whole_of_words
-from .cap_rays import CAP_SQUARE, CLEAR, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit
-from .cap_records import PIXELS, TAPS, record_rays, record_whole
+from .cap_rays import CAP_SQUARE, CLEAR, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
+from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
 from .cap_tiles import (
     AXX,
@@ -41,7 +41,7 @@ WHITE = np.float32(255)
 @fused
 def frame(
     mode: Any, out: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, looks: Any,
-    sides: Any, parts: Any, nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
+    nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
     record: Any,
 ) -> None:  # fmt: skip
     """Go over the pixels of caps, in the order of the caps.
@@ -51,7 +51,7 @@ def frame(
     scene: (h, w, C) bytes; only its size matters unless drawing. boxes: starts, widths, inverse distances (`boxes`).
     border, shift: how the scene goes on, and where the frame is in it. looks: grids, how many looks each has, how many of
     the first look at four boxes each, and bands of areas (`cap_tiles`).
-    sides, parts: rays of pixels at edges (`cap_edges`). nodes, caps, ...: see `cap_rays`, `cap_tiles`.
+    nodes, caps, ...: see `cap_rays`, `cap_tiles`.
     record: pixels, caps' numbers, taps a pixel, clear shares, displacements, unknown; texels, weights; counters.
     """
     starts, pitches, inverses = boxes
@@ -60,6 +60,8 @@ def frame(
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
     rays, line = np.zeros(PLANES * 64, dtype=np.float32), np.zeros(15, dtype=np.float32)
     tile, total, at = np.zeros((5, 3, 3), np.float32), np.zeros(4, np.float32), np.zeros(ROUND * 64, np.uint32)
+    slopes = np.zeros(12, dtype=np.float32)
+    spread_rays(rays)
     quarters, slots = np.zeros(ROUND * 64, np.uint32), np.zeros((3, ROUND), np.int64)
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
@@ -95,10 +97,12 @@ def frame(
                     shares_of_row(tile, t, s, lanes, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
                         taken(tile, t, s, lanes, wide, caps, number, rivals, outline, line, rays)
+                    of_row(tile, t, line)
+                    slopes_of_row(tile, t, slopes)
                     if mode != DRAW:
                         record_row(
-                            mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, tile, t, s, edge,
-                            caps, outlines, later, view, sides, parts, (scene.shape[1], scene.shape[0]), starts, pitches,
+                            mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, edge, caps,
+                            outlines, later, view, line, slopes, (scene.shape[1], scene.shape[0]), starts, pitches,
                             inverses, border, shift, grids, counts, fines, rays, at, quarters, total, len(words), width,
                             record,
                         )  # fmt: skip
@@ -111,8 +115,8 @@ def frame(
                             rays, total, at, quarters, slots,
                         )  # fmt: skip
                     edges_of_words(
-                        words, scene, starts, pitches, inverses, last, shift, border, tile, t, s, u1, v, edge,
-                        hangs, tiny, caps, number, outlines, later, view, sides, parts, low, high, rays, total, at,
+                        words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
+                        later, view, low, high, line, slopes, rays, total, at,
                     )  # fmt: skip
                     write_bytes(out, v, u1, lanes, rays)
 
@@ -120,8 +124,8 @@ def frame(
 @fused
 def record_row(
     filling: bool, u: Any, v: Any, number: Any, lanes: Any, low: Any, high: Any, begin: Any, end: Any, tiny: bool,
-    hangs: bool, tile: Any, t: Any, s: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
-    sides: Any, parts: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
+    hangs: bool, s: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
+    line: Any, slopes: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
     counts: Any, fines: Any, rays: Any, at: Any, quarters: Any, mean: Any, boxes: Any, width: Any, record: Any,
 ) -> None:  # fmt: skip
     """Count, or write down, a row's pixels. u, v: column of lane 0, and row. boxes: how many there are."""
@@ -143,23 +147,17 @@ def record_row(
             mean[1] = rays[CY + j] - shift[1] + (rays[AYY + j] + rays[BYY + j]) * bend
             mean[2] = ONE
             off = not rays[FAR + j] >= ZERO
-        elif has_own(rays, lane, low, high, tiny):
+        elif low <= lane < high and has_own(rays, lane, tiny):
             rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
             near, form = rival >= 0 or not rays[ROOM + j] > edge, form_of(u + lane, v, outlines[number], tiny, rival)
-            count = sides[form, 0] * sides[form, 1]
             for which in (number, rival):
-                if which < 0:
-                    continue
-                hidden += own_rays(
-                    tile, t, s + np.float32(lane), near, which, caps, number, rival, later, view, form, sides, parts,
-                    rays,
-                )  # fmt: skip
-                square, far = box_of_rays(rays, count, u + lane, v, outlines[which], last, shift)
-                record_rays(
-                    starts, pitches, inverses, size, shift, border, rays, count, square, boxes, texels, weights,
-                    cursor, filling, mean,
-                )  # fmt: skip
-                off |= far
+                if which >= 0:
+                    hidden += own_rays(
+                        s + np.float32(lane), near, form, which, caps, number, rival, later, view, line, slopes, rays
+                    )  # fmt: skip
+                    off |= add_places(rays, shift, last, mean)
+                    boxes_of_rays(u + lane, v, outlines[which], last, shift, border, len(starts), rays, at)
+                    record_rays(starts, size, rays, at, boxes, texels, weights, cursor, filling)
             rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
         if not rays[HIDDEN + j] > ZERO:
             cursor[TAPS] = before

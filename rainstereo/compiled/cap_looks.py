@@ -37,12 +37,10 @@ from .boxes import channels_of, spread
 from .compile import fused, fused_part
 from .prefetch import to_read
 
-SCALE, BIAS = np.float32(1 / 4), np.float32(0.125)  # of words
-"""What makes gray levels of words; and by how much these are too large, from rounding up when halving the image."""
+BIAS = np.float32(0.125)
+"""Gray levels by which words are too large: halves are rounded up where an image is halved."""
 MIRROR, EDGE, INSIDE = 0, 1, 2
 """How the scene goes on beyond its edges; or that nothing lies beyond them."""
-FINEST = np.float32(4)
-"""Square of the side, pixels, of a look's part below which it is looked up in the image itself."""
 SMALLEST = np.float32(math.sqrt(2) / 16)
 """1 / the square of the side up to which boxes are the smallest: a quarter octave above their own."""
 T_, SS, TT, ST = (np.uint64(64 * i) for i in (1, 2, 3, 4))
@@ -52,7 +50,7 @@ FARTHEST = np.float32(1e6)  # pixels; what lies beyond is not told apart
 MOST = 12
 """Looks along a small patch's side."""
 ROUND = 12  # pixels whose boxes are on their way at a time
-ONE_, TWO_ = np.uint64(1), np.uint64(2)
+ONE_, TWO_, FOUR_ = np.uint64(1), np.uint64(2), np.uint64(4)
 TWO, THREE, FOURTH = np.int32(2), np.int32(3), np.int32(4)
 
 
@@ -71,11 +69,9 @@ def folded(at: Any, last: Any, border: Any) -> Any:
 
 @fused_part
 def size_of(square: Any, sizes: Any) -> Any:
-    """The size of boxes for a part of a patch, of this area; -1: the image itself."""
-    if not square >= FINEST:
-        return -1
+    """The size of boxes for a part of a patch, of this area; -1: the image itself, for a part narrower than 2.4 pixels."""
     octaves = (np.float32(square * SMALLEST).view(np.int32) >> 23) - 127  # of areas: the number's exponent
-    return max(min(octaves, sizes - 1), 0)
+    return max(min(octaves, sizes - 1), 0) if octaves >= -1 else -1
 
 
 @fused_part
@@ -159,9 +155,14 @@ def places(
 @fused_part
 def sum_of(words: Any, at: Any, first: Any, count: Any) -> Any:
     """Of some boxes."""
-    found = np.uint64(0)
-    for look in range(first, first + np.uint64(count)):
-        found += spread(words[np.uint64(at[look])])
+    found, stop = np.uint64(0), first + np.uint64(count)
+    fours = first + np.uint64(count // 4 * 4)
+    for k in range(first, fours, FOUR_):
+        a, b = words[np.uint64(at[k])], words[np.uint64(at[k + ONE_])]
+        c, d = words[np.uint64(at[k + TWO_])], words[np.uint64(at[k + TWO_ + ONE_])]
+        found += spread((a + b) + (c + d))
+    for k in range(fours, stop):
+        found += spread(words[np.uint64(at[k])])
     return found
 
 
@@ -243,6 +244,6 @@ def whole_of_words(
             made += 1
         for i in range(np.uint64(made)):
             j, count, pitch = np.uint64(slots[np.uint64(0), i]), slots[ONE_, i], slots[TWO_, i]
-            unit = SCALE / np.float32(16 * count) if pitch else SCALE / np.float32(count)
+            unit = ONE / np.float32(16 * count) if pitch else ONE / np.float32(count)
             found = sum_of_means(words, pitch, at, parts, np.uint64(64) * i, count) if pitch else sum_of(words, at, np.uint64(64) * i, count)
             show(rays, j, found, rays[GAINS + j] * rays[HIDDEN + j] * unit, BIAS / unit)

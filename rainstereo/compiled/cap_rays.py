@@ -28,7 +28,9 @@ HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))
 SHOWN, CLEAR = np.uint64(64 * 45), np.uint64(64 * 48)
 """What a row shows, three channels a pixel, and the share that is clear, thrice."""
 WEIGHT, STRETCH = np.uint64(64 * 51), np.uint64(64 * 52)
-PLANES = 53
+PLACES = np.uint64(64 * 53)
+"""Where on a pixel its own rays are: x and y of each of three forms (`cap_edges`)."""
+PLANES = 59
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)

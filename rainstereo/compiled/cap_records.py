@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from .cap_edges import WIDER as WIDER_RAY
-from .cap_edges import size_of_ray
-from .cap_looks import FINEST, INSIDE, OF_GRID, SMALLEST, folded, look_at, places, sides, size_of
-from .cap_rays import HALF, HIDDEN, ONE, STRETCH, SUB, WEIGHT, Y_, ZERO
+from .cap_edges import LANES, NO_BOX, SIZE_BITS
+from .cap_looks import INSIDE, OF_GRID, look_at, places, sides, size_of
+from .cap_rays import HIDDEN, ONE, SUB, WEIGHT, Y_, ZERO
 from .cap_tiles import FAR, GAINS, GRID, PART
 from .compile import fused, fused_part
 
@@ -74,25 +73,29 @@ def record_whole(
 
 @fused
 def record_rays(
-    starts: Any, pitches: Any, inverses: Any, size: Any, shift: Any, border: Any, rays: Any, number: Any, square: Any,
-    first: Any, texels: Any, weights: Any, cursor: Any, filling: bool, mean: Any,
+    starts: Any, size: Any, rays: Any, at: Any, first: Any, texels: Any, weights: Any, cursor: Any, filling: bool,
 ) -> None:  # fmt: skip
-    """The taps of a pixel with rays of its own; adds the places of those that show something, and how many, to `mean`."""
-    last = np.float32(size[0] - 1), np.float32(size[1] - 1)
-    fine = not square * WIDER_RAY >= FINEST
-    square *= WIDER_RAY * SMALLEST
-    for j in range(np.uint64(number)):
-        weight = rays[WEIGHT + j]
+    """The taps of a pixel with rays of its own, see `cap_edges.boxes_of_rays`."""
+    for j in range(LANES):
+        weight, box = rays[WEIGHT + j], np.int64(at[j])
         if not weight > ZERO:
             continue
-        mean[0] += rays[SUB + j]
-        mean[1] += rays[SUB + Y_ + j]
-        mean[2] += ONE
-        x, y = folded(rays[SUB + j] + shift[0], last[0], border), folded(rays[SUB + Y_ + j] + shift[1], last[1], border)
-        if fine:
-            _bilinear(texels, weights, cursor, filling, first, size, x, y, weight)
+        kind = box >> SIZE_BITS
+        if kind == NO_BOX:
+            _bilinear(texels, weights, cursor, filling, first, size, rays[SUB + j], rays[SUB + Y_ + j], weight)
         else:
-            level = size_of_ray(square, rays[STRETCH + j], np.int32(len(inverses)))
-            one = inverses[level]
-            row, column = int(y * one + (HALF * one + HALF)), int(x * one + (HALF * one + HALF))
-            _tap(texels, weights, cursor, filling, starts[level] + row * pitches[level] + column, weight)
+            _tap(texels, weights, cursor, filling, starts[kind] + (box & ((1 << SIZE_BITS) - 1)), weight)
+
+
+@fused_part
+def add_places(rays: Any, shift: Any, last: Any, mean: Any) -> bool:
+    """Add the places of a pixel's own rays that show something, and how many, to `mean`; whether one is off the scene."""
+    off = False
+    for j in range(LANES):
+        if rays[WEIGHT + j] > ZERO:
+            u, v = rays[SUB + j] + shift[0], rays[SUB + Y_ + j] + shift[1]
+            off |= u < ZERO or v < ZERO or u > last[0] or v > last[1]
+            mean[0] += rays[SUB + j]
+            mean[1] += rays[SUB + Y_ + j]
+            mean[2] += ONE
+    return off

@@ -16,7 +16,6 @@ from rainstereo.types import Array, Image
 
 from .pyramid import half
 
-SCALE = 4  # of bytes in words
 SECOND = 2  # pixels between the boxes of up to `DENSE` pixels
 DENSE = 16
 LARGEST = 1024

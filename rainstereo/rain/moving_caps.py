@@ -33,10 +33,10 @@ from .outlines import Outlines
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE = ((20.0, 8), (24.0, 12), (64.0, 20), (math.inf, 36)), ((8, 2), (2, 8), (4, 4))
-COARSE = ((16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)), ((4, 2), (2, 4), (3, 3))
+FINE = (20.0, 8), (24.0, 12), (64.0, 20), (math.inf, 36)
+COARSE = (16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)
 """Square root of the area, pixels, up to which what a pixel shows gets how many looks, the first of them at four boxes
-each; and rays along and down a pixel at an edge, see `compiled.cap_edges`."""
+each."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
 WIDER = 1.4, 1.25, 1.25, 1.25
 """Area of a box over that of its part of what a pixel shows: a little overlap is best."""
@@ -129,7 +129,7 @@ class CapScene:
         return Boxes.of(self.size)
 
     @property
-    def fineness(self) -> tuple[tuple[tuple[float, int], ...], tuple[tuple[int, int], ...]]:
+    def fineness(self) -> tuple[tuple[float, int], ...]:
         """`FINE` or `COARSE`."""
         return COARSE if self.tolerance >= COARSE_FROM else FINE
 
@@ -139,7 +139,7 @@ class CapScene:
         grids: list[Array] = []
         counts: list[int] = []
         bands: list[tuple[float, int, int, float]] = []
-        for (side, aim), wider in zip(self.fineness[0], WIDER, strict=True):
+        for (side, aim), wider in zip(self.fineness, WIDER, strict=True):
             bands.append((min(side * side, FAR), aim, len(counts) - 2, wider / aim))
             for across in range(2, aim // 2 + 1):
                 down = max(aim // across, 2)
@@ -150,16 +150,6 @@ class CapScene:
         table = np.array(bands, dtype=np.float32)
         return np.concatenate(grids).ravel(), np.array(counts), int(bands[1][2] + 2), table
 
-    @cached_property
-    def parts(self) -> tuple[Indices, Array]:
-        """Rays along and down a pixel; places of them, and 1 for each."""
-        sides = np.array(self.fineness[1], dtype=np.int64)
-        table: Array = np.zeros((len(sides), 3, LANES), dtype=np.float32)
-        for form, (across, down) in zip(table, sides, strict=True):
-            x, y = np.meshgrid(_middles(across), _middles(down))
-            form[:, : x.size] = x.ravel(), y.ravel(), np.ones(x.size)
-        return sides, table.ravel()
-
     def go(self, mode: int, out: Any, scene: Any, words: Any, caps: CapTable, record: Any) -> None:
         """Run the loops over caps, see `compiled.cap_frames.frame`."""
         from rainstereo.compiled.cap_frames import frame
@@ -168,7 +158,7 @@ class CapScene:
         border = 0 if self.border == "mirror" else 1
         shift = np.float32(self.shift[0]), np.float32(self.shift[1])
         frame(
-            mode, out, scene, words, (boxes.start, boxes.width, boxes.inverse), border, shift, self.looks, *self.parts,
+            mode, out, scene, words, (boxes.start, boxes.width, boxes.inverse), border, shift, self.looks,
             caps.nodes, caps.columns, caps.outlines, caps.rivals, lattice.later, lattice.view, record,
         )  # fmt: skip
 
