@@ -24,6 +24,7 @@ from .cap_rays import (
     DIM,
     GAIN,
     HALF,
+    HELD,
     HIDDEN,
     KX,
     KY,
@@ -45,8 +46,10 @@ from .cap_rays import (
 from .cap_shares import contact_share, from_rival
 from .cap_tiles import LITS, WHOLE
 from .compile import fused, fused_part
+from .prefetch import to_read
 
 RAYS, LANES = 16, np.uint64(16)
+HOLDS = 40  # pixels' rays whose boxes are on their way at a time
 FORMS = ((8, 2), (2, 8), (4, 4))
 """Rays along and down a pixel: towards the middle of a cap beside it, above or below it, and in other directions."""
 STEEP = 1.73  # tan of the angle from which it is beside, or above
@@ -105,6 +108,19 @@ def _along(line: Any, plane: int, s: Any) -> Any:
     return line[3 * plane + 1] + (s + s) * line[3 * plane + 2]
 
 
+@fused_part
+def _set_out(rays: Any, places: Any, px: Any, py: Any, kx: Any, ky: Any, dim: Any, along: Any, below: Any) -> None:
+    """Rays at places on a pixel, whose middle's ray is known, and how it changes a pixel along and down."""
+    for j in range(LANES):
+        x, y = rays[places + j], rays[places + Y_ + j]
+        rays[PX + j] = px + (x * along[0] + y * below[0])
+        rays[PY + j] = py + (x * along[1] + y * below[1])
+        rays[KX + j] = kx + (x * along[2] + y * below[2])
+        rays[KY + j] = ky + (x * along[3] + y * below[3])
+        rays[DIM + j] = dim
+        rays[SHARE + j] = np.float32(1 / RAYS)
+
+
 @fused
 def own_rays(
     s: Any, near: bool, form: Any, which: Any, caps: Any, number: Any, rival: Any, later: Any, view: Any,
@@ -119,18 +135,17 @@ def own_rays(
     """
     width = np.float32(0.125) if form == 0 else HALF if form == 1 else np.float32(0.25)
     part = ONE / np.float32(RAYS)
-    height, first, own = part / width, PLACES + np.uint64(128 * form), which == number
+    height, own = part / width, which == number
     px, py, kx, ky, dim = _at(line, 0, s), _at(line, 1, s), _at(line, 2, s), _at(line, 3, s), _at(line, 4, s)
     xu, yu, au, bu = _along(line, 0, s), _along(line, 1, s), _along(line, 2, s), _along(line, 3, s)
     xv, yv, av, bv = _at(slopes, 0, s), _at(slopes, 1, s), _at(slopes, 2, s), _at(slopes, 3, s)
-    for j in range(LANES):
-        x, y = rays[first + j], rays[first + Y_ + j]
-        rays[PX + j] = px + (x * xu + y * xv)
-        rays[PY + j] = py + (x * yu + y * yv)
-        rays[KX + j] = kx + (x * au + y * av)
-        rays[KY + j] = ky + (x * bu + y * bv)
-        rays[DIM + j] = dim
-        rays[SHARE + j] = part
+    along, below = (xu, yu, au, bu), (xv, yv, av, bv)
+    if form == 0:
+        _set_out(rays, PLACES, px, py, kx, ky, dim, along, below)
+    elif form == 1:
+        _set_out(rays, PLACES + np.uint64(128), px, py, kx, ky, dim, along, below)
+    else:
+        _set_out(rays, PLACES + np.uint64(256), px, py, kx, ky, dim, along, below)
     if rival >= 0:
         dx, dy, need = from_rival(caps, number, rival)
         square, other = np.float32(caps[number, CAP_SQUARE]), np.float32(caps[rival, CAP_SQUARE])
@@ -201,52 +216,76 @@ def boxes_of_rays(u: Any, v: Any, outline: Any, last: Any, shift: Any, border: A
         at[j] = np.uint32(box) + (np.uint32(NO_BOX if none else size) << np.uint32(SIZE_BITS))
 
 
-@fused
-def rays_of_words(words: Any, scene: Any, starts: Any, rays: Any, at: Any, total: Any) -> None:
-    """Add what a pixel's own rays show to `total`, (C,)."""
-    red, green, blue, boxed = ZERO, ZERO, ZERO, ZERO
+@fused_part
+def hold(words: Any, scene: Any, starts: Any, rays: Any, at: Any, first: Any, total: Any) -> None:
+    """Call for the boxes of a pixel's rays, numbered in `at` from `first` on, and keep its weights; add what rays show
+    that look at the image itself to `total`."""
     for j in range(LANES):
-        weight, box = rays[WEIGHT + j], np.uint64(at[j])
+        box = np.uint64(at[j])
         size = box >> np.uint64(SIZE_BITS)
         if size == np.uint64(NO_BOX):
             for channel in range(scene.shape[2]):
-                total[channel] += weight * pixel_value(scene, rays[SUB + j], rays[SUB + Y_ + j], channel)
-            continue
-        word = words[np.uint64(starts[size]) + (box & np.uint64((1 << SIZE_BITS) - 1))]
+                part = pixel_value(scene, rays[SUB + j], rays[SUB + Y_ + j], channel)
+                total[channel] += rays[WEIGHT + j] * part
+            at[first + j] = np.uint32(0)
+            rays[HELD + first + j] = ZERO
+        else:
+            box = np.uint64(starts[size]) + (box & np.uint64((1 << SIZE_BITS) - 1))
+            to_read(words, box)
+            at[first + j] = np.uint32(box)
+            rays[HELD + first + j] = rays[WEIGHT + j]
+
+
+@fused_part
+def show_held(words: Any, rays: Any, at: Any, first: Any, lane: Any) -> None:
+    """Add what the boxes hold that were called for to what a lane shows."""
+    red, green, blue, boxed = ZERO, ZERO, ZERO, ZERO
+    for j in range(first, first + LANES):
+        weight, word = rays[HELD + j], words[np.uint64(at[j])]
         boxed += weight
         red += weight * np.float32(np.int32(word & FIRST))
         green += weight * np.float32(np.int32((word >> FIELD) & FIRST))
         blue += weight * np.float32(np.int32(word >> TWICE))
-    total[0] += red - boxed * BIAS
-    total[1] += green - boxed * BIAS
-    total[2] += blue - boxed * BIAS
+    k, boxed = SHOWN + lane + lane + lane, boxed * BIAS
+    rays[k] += red - boxed
+    rays[k + ONE_] += green - boxed
+    rays[k + TWO_] += blue - boxed
 
 
 @fused
 def edges_of_words(
     words: Any, scene: Any, starts: Any, last: Any, shift: Any, border: Any, s: Any, u: Any, v: Any, edge: Any,
     hangs: bool, tiny: bool, caps: Any, number: Any, outlines: Any, later: Any, view: Any, low: Any, high: Any,
-    line: Any, slopes: Any, rays: Any, total: Any, at: Any,
+    line: Any, slopes: Any, rays: Any, total: Any, at: Any, slots: Any,
 ) -> None:  # fmt: skip
-    """What those pixels of a row show that have rays of their own: to `SHOWN`, and what caps hide of them.
+    """Add what those pixels of a row show that have rays of their own to `SHOWN`; and what caps hide of them.
 
-    u, v: column of lane 0, and row. line, slopes: of the row.
+    u, v: column of lane 0, and row. line, slopes: of the row. at, slots: (HOLDS * 16 + 16,) uint32 and (3, HOLDS) int64.
     """
-    for lane in range(low, high):
-        if not has_own(rays, lane, tiny):
-            continue
-        j = np.uint64(lane)
-        rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
-        near = rival >= 0 or not rays[ROOM + j] > edge
-        form = form_of(u + lane, v, outlines[number], tiny, rival)
-        total[:] = ZERO
-        for which in (number, rival):
-            if which >= 0:
-                hidden += own_rays(
-                    s + np.float32(lane), near, form, which, caps, number, rival, later, view, line, slopes, rays
-                )  # fmt: skip
-                boxes_of_rays(u + lane, v, outlines[which], last, shift, border, len(starts), rays, at)
-                rays_of_words(words, scene, starts, rays, at, total)
-        rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
-        k = SHOWN + j + j + j
-        rays[k], rays[k + ONE_], rays[k + TWO_] = total[0], total[1], total[2]
+    lane = low
+    while lane < high:
+        held = 0
+        while lane < high and held + 1 < HOLDS:
+            j = np.uint64(lane)
+            lane += 1
+            if not has_own(rays, j, tiny):
+                continue
+            rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
+            near, column = rival >= 0 or not rays[ROOM + j] > edge, u + lane - 1
+            form = form_of(column, v, outlines[number], tiny, rival)
+            total[:] = ZERO
+            for which in (number, rival):
+                if which >= 0:
+                    hidden += own_rays(
+                        s + np.float32(np.int32(j)), near, form, which, caps, number, rival, later, view, line, slopes,
+                        rays,
+                    )  # fmt: skip
+                    boxes_of_rays(column, v, outlines[which], last, shift, border, len(starts), rays, at)
+                    hold(words, scene, starts, rays, at, LANES * np.uint64(held + 1), total)
+                    slots[np.uint64(0), np.uint64(held)] = np.int64(j)
+                    held += 1
+            rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
+            k = SHOWN + j + j + j
+            rays[k], rays[k + ONE_], rays[k + TWO_] = total[0], total[1], total[2]
+        for i in range(np.uint64(held)):
+            show_held(words, rays, at, LANES * (i + ONE_), np.uint64(slots[np.uint64(0), i]))

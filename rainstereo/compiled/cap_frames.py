@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .cap_edges import boxes_of_rays, edges_of_words, form_of, has_own, own_rays, slopes_of_row, spread_rays
+from .cap_edges import HOLDS, boxes_of_rays, edges_of_words, form_of, has_own, own_rays, slopes_of_row, spread_rays
 from .cap_looks import ROUND, is_whole, whole_of_words
 from .cap_rays import CAP_SQUARE, CLEAR, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
 from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
@@ -62,7 +62,7 @@ def frame(
     tile, total, at = np.zeros((5, 3, 3), np.float32), np.zeros(4, np.float32), np.zeros(ROUND * 64, np.uint32)
     slopes = np.zeros(12, dtype=np.float32)
     spread_rays(rays)
-    quarters, slots = np.zeros(ROUND * 64, np.uint32), np.zeros((3, ROUND), np.int64)
+    quarters, slots = np.zeros(ROUND * 64, np.uint32), np.zeros((3, max(ROUND, HOLDS)), np.int64)
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
@@ -116,7 +116,7 @@ def frame(
                         )  # fmt: skip
                     edges_of_words(
                         words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
-                        later, view, low, high, line, slopes, rays, total, at,
+                        later, view, low, high, line, slopes, rays, total, at, slots,
                     )  # fmt: skip
                     write_bytes(out, v, u1, lanes, rays)
 

@@ -30,7 +30,9 @@ SHOWN, CLEAR = np.uint64(64 * 45), np.uint64(64 * 48)
 WEIGHT, STRETCH = np.uint64(64 * 51), np.uint64(64 * 52)
 PLACES = np.uint64(64 * 53)
 """Where on a pixel its own rays are: x and y of each of three forms (`cap_edges`)."""
-PLANES = 59
+HELD = np.uint64(64 * 59)
+"""Weights of rays whose boxes are on their way from memory."""
+PLANES = 71
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
