@@ -182,7 +182,7 @@ def softness(cap: Any, px: Any, py: Any, kx: Any, ky: Any, xu: Any, xv: Any, yu:
     return curvature * curvature * np.float32(math.sqrt(gu * gu + gv * gv))
 
 
-@fused
+@fused_part
 def boxes_of_rays(u: Any, v: Any, outline: Any, last: Any, shift: Any, border: Any, sizes: Any, rays: Any, at: Any) -> None:
     """The boxes that the rays of a pixel at u, v look at: each one's number among those of its size, and, from bit
     `SIZE_BITS` on, the size, to `at`, uint32; and the places of rays in the scene, brought into it, to `SUB`.

@@ -174,13 +174,14 @@ def record_row(
 @fused
 def write_bytes(out: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
     """Mix what a row shows with what is there, where a cap hides it."""
-    channels = np.uint64(out.shape[2])
-    first, row, three = np.uint64(u) * channels, out[v].ravel(), np.uint64(3)
-    for j in range(np.uint64(lanes)):
+    channels, three, block = np.uint64(out.shape[2]), np.uint64(3), np.uint64(32)
+    row, first = out[v].ravel(), np.uint64(u) * channels
+    for j in range(np.uint64(64)):
         for channel in range(three):
             rays[CLEAR + three * j + channel] = ONE - rays[HIDDEN + j]
     if channels == three:
-        for k in range(three * np.uint64(lanes)):
+        count = (three * np.uint64(lanes) + block - np.uint64(1)) // block * block  # whole vectors: beyond, all is clear
+        for k in range(min(count, np.uint64(len(row)) - first)):
             value = rays[SHOWN + k] + rays[CLEAR + k] * np.float32(row[first + k]) + HALF
             row[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))
         return

@@ -110,7 +110,7 @@ def contacts(tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, line: Any
         rays[HIDDEN + j] = share if share > ZERO else ZERO
 
 
-@fused
+@fused_part
 def shares_of_row(
     tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, hangs: bool, cap: Any,
     line: Any, rays: Any,

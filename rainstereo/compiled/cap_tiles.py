@@ -84,7 +84,7 @@ def hangs_over(tile: Any, cap: Any, wide: Any, reach: Any) -> Any:
     return math.sqrt(square) * out > math.sqrt(max(1 - square, 0.0)) * cap[CAP_DEPTH]
 
 
-@fused
+@fused_part
 def next_span(tile: Any, t: Any, s: Any, lanes: Any, cap: Any, slack: Any, line: Any, rays: Any) -> Any:
     """Fill the plane of room of a row, and say between which lanes its rays meet the contact circle, or nearly."""
     of_row(tile, t, line)
@@ -109,7 +109,7 @@ def trace_lanes(
     cross(cap, later, view, rays, low, end, to, False, ONE)
 
 
-@fused
+@fused_part
 def row_of_tile(
     tile: Any, t: Any, s: Any, is_first: bool, span: Any, following: Any, cap: Any,
     later: Any, view: Any, line: Any, rays: Any,
@@ -175,7 +175,7 @@ def reach(ax: Any, bx: Any, axx: Any, bxx: Any, mixed: Any) -> Any:
     return HALF * (abs(ax) + abs(bx)) + np.float32(0.125) * (abs(axx) + abs(bxx)) + np.float32(0.25) * abs(mixed)
 
 
-@fused
+@fused_part
 def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -> None:
     """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel.
 
@@ -225,7 +225,7 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -
         rays[GRID + j] = first + (across if across > two else two)
 
 
-@fused
+@fused_part
 def move_up(rays: Any) -> None:
     """What was below a row is above the next, and what was next to come is at hand."""
     for j in range(np.uint64(3 * 64)):

@@ -12,7 +12,7 @@ from rainstereo import Camera, Chamber, Panel
 from rainstereo.compiled import available
 from rainstereo.droplet import SphericalCap
 from rainstereo.rain import render
-from rainstereo.rain.boxes import SCALE, Boxes
+from rainstereo.rain.boxes import Boxes
 from rainstereo.rain.drops import Drops
 from rainstereo.rain.moving_caps import CapScene, CapTable
 from rainstereo.rain.outlines import Outlines
@@ -198,18 +198,56 @@ def test_a_sequence_draws_what_a_plan_draws():
         np.testing.assert_array_equal(sequence.plan(drops).apply(image), renderer.plan(drops).apply(image))
 
 
+@pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("size", [(64, 48), (37, 23), (3, 5), (1, 1)])
-def test_boxes_are_means(size):
+def test_boxes_are_means(size, channels):
+    from rainstereo.compiled.boxes import BITS
+
     boxes = Boxes.of(size)
-    image = np.random.default_rng(1).integers(0, 256, (*size[::-1], 3), dtype=np.uint8)
+    image = np.random.default_rng(1).integers(0, 256, (*size[::-1], channels), dtype=np.uint8)
     words, numbers = boxes.words(image), boxes.numbers(image)
-    fields = np.stack([words >> np.uint64(21 * i) & np.uint64((1 << 21) - 1) for i in range(3)], -1) / SCALE
-    assert np.abs(fields - numbers).max() <= 0.5
+    fields = np.stack([words >> np.uint32(BITS * i) & np.uint32((1 << BITS) - 1) for i in range(channels)], -1)
+    assert np.abs(fields - numbers).max() <= 2
     if size == (64, 48):
-        for k, step, side in ((0, 2, 4), (1, 2, 8), (2, 4, 16), (3, 8, 32)):
+        assert abs((fields - numbers).mean() - 0.125) < 0.1  # halves are rounded up once
+        assert [round(1 / float(inverse)) for inverse in boxes.inverse[:7]] == [2, 2, 2, 2, 2, 4, 4]
+        for k, step, side in ((0, 2, 4), (2, 2, 8), (4, 2, 16), (6, 4, 32)):
             i, j = 32 // step, 24 // step
             part = image[24 - side // 2 : 24 + side // 2, 32 - side // 2 : 32 + side // 2]
             np.testing.assert_allclose(boxes.part(numbers, k)[j, i], part.mean((0, 1)), atol=1e-3)
+        for k in (1, 3, 5):
+            small, large = boxes.part(numbers, k - 1), boxes.part(numbers, k + 1)
+            step = round(float(boxes.inverse[k - 1] / boxes.inverse[k + 1]))
+            np.testing.assert_allclose(boxes.part(numbers, k), (small[::step, ::step] + large) / 2, atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [(1280, 960), (37, 23), (3, 5)])
+def test_loops_know_how_boxes_are_laid_out(size):
+    """Own rays compute what a table says of a size: pixels between boxes, and boxes in a row."""
+    from rainstereo.compiled.cap_edges import SIZE_BITS, boxes_of_rays
+    from rainstereo.compiled.cap_rays import PLANES, STRETCH, SUB, WEIGHT, Y_
+
+    boxes, sizes = Boxes.of(size), set[int]()
+    width, height = size
+    rays, at = np.zeros(PLANES * 64, np.float32), np.zeros(64, np.uint32)
+    planes = rays.reshape(-1, 64)
+    rng = np.random.default_rng(2)
+    for _ in range(40):
+        x, y = rng.uniform(0, width - 1, 16), rng.uniform(0, height - 1, 16)
+        planes[int(SUB) // 64, :16], planes[int(SUB + Y_) // 64, :16] = x, y
+        planes[int(WEIGHT) // 64, :16], planes[int(STRETCH) // 64, :16] = 1, 10 ** rng.uniform(0, 6, 16)
+        last = np.float32(width - 1), np.float32(height - 1)
+        boxes_of_rays(3, 4, np.array([1.0, 2.0]), last, (np.float32(0), np.float32(0)), 0, len(boxes.start), rays, at)
+        for box, u, v in zip(at[:16].tolist(), x, y, strict=True):
+            size_of_box, number = box >> SIZE_BITS, box & ((1 << SIZE_BITS) - 1)
+            if size_of_box == 31:
+                continue
+            sizes.add(size_of_box)
+            row, column = divmod(number, int(boxes.width[size_of_box]))
+            step = 1 / float(boxes.inverse[size_of_box])
+            assert abs(column * step - 0.5 - u) <= step / 2 + 1e-3
+            assert abs(row * step - 0.5 - v) <= step / 2 + 1e-3
+    assert len(sizes) >= min(5, len(boxes.start))
 
 
 caps = st.lists(
