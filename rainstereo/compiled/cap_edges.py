@@ -29,13 +29,14 @@ from .cap_rays import (
     KX,
     KY,
     ONE,
-    PLACES,
+    PER,
     PX,
     PY,
     RIVAL,
     ROOM,
     SHARE,
     SHOWN,
+    SPREAD,
     STRETCH,
     SUB,
     WEIGHT,
@@ -49,7 +50,7 @@ from .compile import fused, fused_part
 from .prefetch import to_read
 
 RAYS, LANES = 16, np.uint64(16)
-HOLDS = 40  # pixels' rays whose boxes are on their way at a time
+TOGETHER, HOLDS = 4, 112  # pixels whose rays are traced at once, and, at most, of a row: two where caps meet
 FORMS = ((8, 2), (2, 8), (4, 4))
 """Rays along and down a pixel: towards the middle of a cap beside it, above or below it, and in other directions."""
 STEEP = 1.73  # tan of the angle from which it is beside, or above
@@ -58,18 +59,6 @@ WIDER = np.float32(1.6)
 SOFTEST = np.float32(1e-3)  # less is lost in rounding
 SIZE_BITS, NO_BOX = 27, 31
 """From which bit on a box's number holds its size; and the size that is the image itself."""
-
-
-@fused_part
-def spread_rays(rays: Any) -> None:
-    """Fill `PLACES`: of each of `FORMS`, where on a pixel its rays are, -1/2 to 1/2 along and down."""
-    for form in range(3):
-        across = 8 if form == 0 else 2 if form == 1 else 4
-        for j in range(RAYS):
-            x, y = np.float32(j % across), np.float32(j // across)
-            first = PLACES + np.uint64(128 * form + j)
-            rays[first] = (x + HALF) / np.float32(across) - HALF
-            rays[first + Y_] = (y + HALF) * np.float32(across) / np.float32(RAYS) - HALF
 
 
 @fused_part
@@ -108,69 +97,72 @@ def _along(line: Any, plane: int, s: Any) -> Any:
     return line[3 * plane + 1] + (s + s) * line[3 * plane + 2]
 
 
-@fused_part
-def _set_out(rays: Any, places: Any, px: Any, py: Any, kx: Any, ky: Any, dim: Any, along: Any, below: Any) -> None:
-    """Rays at places on a pixel, whose middle's ray is known, and how it changes a pixel along and down."""
-    for j in range(LANES):
-        x, y = rays[places + j], rays[places + Y_ + j]
-        rays[PX + j] = px + (x * along[0] + y * below[0])
-        rays[PY + j] = py + (x * along[1] + y * below[1])
-        rays[KX + j] = kx + (x * along[2] + y * below[2])
-        rays[KY + j] = ky + (x * along[3] + y * below[3])
-        rays[DIM + j] = dim
-        rays[SHARE + j] = np.float32(1 / RAYS)
-
-
 @fused
-def own_rays(
-    s: Any, near: bool, form: Any, which: Any, caps: Any, number: Any, rival: Any, later: Any, view: Any,
-    line: Any, slopes: Any, rays: Any,
+def set_out(
+    s: Any, u: Any, v: Any, near: bool, form: Any, which: Any, caps: Any, number: Any, rival: Any, outlines: Any,
+    line: Any, slopes: Any, rays: Any, first: Any,
 ) -> Any:  # fmt: skip
-    """The rays of one pixel to the planes `SUB`, their weights to `WEIGHT`: of each its gain and the share of the
-    pixel that it stands for. Returns how much of the pixel the cap hides.
+    """Take up the rays of one pixel, lanes from `first` on, with the share of the pixel that each stands for. Returns how
+    much of the pixel the cap hides.
 
-    s: pixels from the tile's own along a row; line, slopes: of the row. near: whether the contact line may cross the
-    pixel. which: the cap that the rays go through, `number` or `rival` (-1: none); each has the parts of the pixel
-    where it has more room than the other.
+    s: pixels from the tile's own along a row; line, slopes: of the row. u, v: in the image. near: whether the contact
+    line may cross the pixel. which: the cap that the rays go through, `number` or `rival` (-1: none); each has the parts
+    of the pixel where it has more room than the other.
     """
-    width = np.float32(0.125) if form == 0 else HALF if form == 1 else np.float32(0.25)
-    part = ONE / np.float32(RAYS)
+    bits = np.int32(3) if form == 0 else np.int32(1) if form == 1 else np.int32(2)  # of a ray's number: along a row
+    mask = np.int32((1 << bits) - 1)
+    width, part = ONE / np.float32(1 << bits), np.float32(1 / RAYS)
     height, own = part / width, which == number
     px, py, kx, ky, dim = _at(line, 0, s), _at(line, 1, s), _at(line, 2, s), _at(line, 3, s), _at(line, 4, s)
     xu, yu, au, bu = _along(line, 0, s), _along(line, 1, s), _along(line, 2, s), _along(line, 3, s)
     xv, yv, av, bv = _at(slopes, 0, s), _at(slopes, 1, s), _at(slopes, 2, s), _at(slopes, 3, s)
-    along, below = (xu, yu, au, bu), (xv, yv, av, bv)
-    if form == 0:
-        _set_out(rays, PLACES, px, py, kx, ky, dim, along, below)
-    elif form == 1:
-        _set_out(rays, PLACES + np.uint64(128), px, py, kx, ky, dim, along, below)
-    else:
-        _set_out(rays, PLACES + np.uint64(256), px, py, kx, ky, dim, along, below)
+    dx, dy, need = ZERO, ZERO, ZERO
     if rival >= 0:
         dx, dy, need = from_rival(caps, number, rival)
+    x0, y0 = (px, py) if own else (px - dx, py - dy)
+    cap = caps[which]
+    soft = softness(cap, x0, y0, kx, ky, xu * width, xv * height, yu * width, yv * height)
+    soft = soft if soft > SOFTEST else SOFTEST
+    far_x, far_y = np.float32(u - outlines[which, 0]), np.float32(v - outlines[which, 1])
+    per, start_x, start_y = far_x * far_x + far_y * far_y, HALF * width - HALF, HALF * height - HALF
+    per = WIDER * SMALLEST * part / (per if per > ONE else ONE)
+    for j in range(LANES):
+        i, k = first + j, np.int32(j)
+        x, y = np.float32(k & mask) * width + start_x, np.float32(k >> bits) * height + start_y
+        rays[PX + i] = x0 + (x * xu + y * xv)
+        rays[PY + i] = y0 + (x * yu + y * yv)
+        rays[KX + i] = kx + (x * au + y * av)
+        rays[KY + i] = ky + (x * bu + y * bv)
+        rays[DIM + i] = dim
+        rays[SHARE + i] = part
+        rays[SPREAD + i] = soft
+        rays[PER + i] = per
+    if not near:
+        return ONE
+    if rival >= 0:
         square, other = np.float32(caps[number, CAP_SQUARE]), np.float32(caps[rival, CAP_SQUARE])
-        for j in range(LANES):
-            x, y = rays[PX + j], rays[PY + j]
+        back_x, back_y = (ZERO, ZERO) if own else (dx, dy)
+        for i in range(first, first + LANES):
+            x, y = rays[PX + i] + back_x, rays[PY + i] + back_y
             gx, gy = x - dx, y - dy
             more = (other - gx * gx - gy * gy) - ((square - x * x - y * y) + need)
-            rays[SHARE + j] = part if (more > ZERO) != own else ZERO
-            rays[PX + j] = x if own else gx
-            rays[PY + j] = y if own else gy
-        px, py = (px, py) if own else (px - dx, py - dy)
-    total = ONE
-    if near:
-        radius, total = np.float32(math.sqrt(caps[which, CAP_SQUARE])), ZERO
-        for j in range(LANES):
-            share = contact_share(rays[PX + j], rays[PY + j], radius, xu * width, xv * height, yu * width, yv * height)
-            rays[SHARE + j] *= share if share > ZERO else ZERO
-        for j in range(LANES):
-            total += rays[SHARE + j]
-    cap = caps[which]
-    step = softness(cap, px, py, kx, ky, xu * width, xv * height, yu * width, yv * height)
-    cross(cap, later, view, rays, 0, RAYS, SUB, True, step if step > SOFTEST else SOFTEST)
-    for j in range(LANES):
-        rays[WEIGHT + j] = rays[SUB + GAIN + j] * rays[SHARE + j]
+            rays[SHARE + i] = part if (more > ZERO) != own else ZERO
+    radius, total = np.float32(math.sqrt(cap[CAP_SQUARE])), ZERO
+    for i in range(first, first + LANES):
+        share = contact_share(rays[PX + i], rays[PY + i], radius, xu * width, xv * height, yu * width, yv * height)
+        rays[SHARE + i] *= share if share > ZERO else ZERO
+    for i in range(first, first + LANES):
+        total += rays[SHARE + i]
     return total
+
+
+@fused
+def trace_own(cap: Any, later: Any, view: Any, rays: Any, lanes: Any) -> None:
+    """Rays that were set out, from lane 0 to before `lanes`, to the planes `SUB`; and to `WEIGHT` the gain of each times
+    the share of the pixel that it stands for."""
+    cross(cap, later, view, rays, 0, lanes, SUB, True)
+    for j in range(np.uint64(lanes)):
+        rays[WEIGHT + j] = rays[SUB + GAIN + j] * rays[SHARE + j]
 
 
 @fused_part
@@ -182,25 +174,26 @@ def softness(cap: Any, px: Any, py: Any, kx: Any, ky: Any, xu: Any, xv: Any, yu:
     return curvature * curvature * np.float32(math.sqrt(gu * gu + gv * gv))
 
 
-@fused_part
-def boxes_of_rays(u: Any, v: Any, outline: Any, last: Any, shift: Any, border: Any, sizes: Any, rays: Any, at: Any) -> None:
-    """The boxes that the rays of a pixel at u, v look at: each one's number among those of its size, and, from bit
+@fused
+def boxes_of_rays(
+    outline: Any, last: Any, shift: Any, border: Any, sizes: Any, rays: Any, lanes: Any, at: Any
+) -> None:  # fmt: skip
+    """The boxes that rays look at, lanes up to before `lanes`: each one's number among those of its size, and, from bit
     `SIZE_BITS` on, the size, to `at`, uint32; and the places of rays in the scene, brought into it, to `SUB`.
 
     outline: of the cap. sizes: of boxes that there are.
     """
     middle_x, middle_y = np.float32(outline[0]) + shift[0], np.float32(outline[1]) + shift[1]
-    dx, dy = np.float32(u) + shift[0] - middle_x, np.float32(v) + shift[1] - middle_y
-    per, two = WIDER * SMALLEST / (max(dx * dx + dy * dy, ONE) * np.float32(RAYS)), np.float32(2)
+    two = np.float32(2)
     most, wide = np.int32(sizes - 1), np.int32(last[0])
     one, zero, exponent = np.int32(1), np.int32(0), np.int32(127)
-    for j in range(LANES):
+    for j in range(np.uint64(lanes)):
         x, y = rays[SUB + j] + shift[0], rays[SUB + Y_ + j] + shift[1]
         x, y = (x, y) if rays[WEIGHT + j] > ZERO else (ZERO, ZERO)
         gx, gy = x - middle_x, y - middle_y
         longer = rays[STRETCH + j] + rays[STRETCH + j] - two
         longer = longer if longer > ONE else ONE
-        size = (np.float32((gx * gx + gy * gy) * per * longer).view(np.int32) >> np.int32(23)) - exponent
+        size = (np.float32((gx * gx + gy * gy) * rays[PER + j] * longer).view(np.int32) >> np.int32(23)) - exponent
         none = size < -one
         size = size if size > zero else zero
         size = size if size < most else most
@@ -217,23 +210,24 @@ def boxes_of_rays(u: Any, v: Any, outline: Any, last: Any, shift: Any, border: A
 
 
 @fused_part
-def hold(words: Any, scene: Any, starts: Any, rays: Any, at: Any, first: Any, total: Any) -> None:
-    """Call for the boxes of a pixel's rays, numbered in `at` from `first` on, and keep its weights; add what rays show
-    that look at the image itself to `total`."""
+def hold(words: Any, scene: Any, starts: Any, rays: Any, at: Any, first: Any, to: Any, lane: Any) -> None:
+    """Call for the boxes of a pixel's rays, lanes from `first` on, and keep their numbers and weights from `to` on; what
+    rays show that look at the image itself is added to what the pixel of a lane shows at once."""
     for j in range(LANES):
-        box = np.uint64(at[j])
+        box = np.uint64(at[first + j])
         size = box >> np.uint64(SIZE_BITS)
+        weight = rays[WEIGHT + first + j]
         if size == np.uint64(NO_BOX):
             for channel in range(scene.shape[2]):
-                part = pixel_value(scene, rays[SUB + j], rays[SUB + Y_ + j], channel)
-                total[channel] += rays[WEIGHT + j] * part
-            at[first + j] = np.uint32(0)
-            rays[HELD + first + j] = ZERO
+                part = pixel_value(scene, rays[SUB + first + j], rays[SUB + Y_ + first + j], channel)
+                rays[SHOWN + lane + lane + lane + np.uint64(channel)] += weight * part
+            at[np.uint64(64) + to + j] = np.uint32(0)
+            rays[HELD + to + j] = ZERO
         else:
             box = np.uint64(starts[size]) + (box & np.uint64((1 << SIZE_BITS) - 1))
             to_read(words, box)
-            at[first + j] = np.uint32(box)
-            rays[HELD + first + j] = rays[WEIGHT + j]
+            at[np.uint64(64) + to + j] = np.uint32(box)
+            rays[HELD + to + j] = weight
 
 
 @fused_part
@@ -241,7 +235,7 @@ def show_held(words: Any, rays: Any, at: Any, first: Any, lane: Any) -> None:
     """Add what the boxes hold that were called for to what a lane shows."""
     red, green, blue, boxed = ZERO, ZERO, ZERO, ZERO
     for j in range(first, first + LANES):
-        weight, word = rays[HELD + j], words[np.uint64(at[j])]
+        weight, word = rays[HELD + j], words[np.uint64(at[np.uint64(64) + j])]
         boxed += weight
         red += weight * np.float32(np.int32(word & FIRST))
         green += weight * np.float32(np.int32((word >> FIELD) & FIRST))
@@ -256,36 +250,47 @@ def show_held(words: Any, rays: Any, at: Any, first: Any, lane: Any) -> None:
 def edges_of_words(
     words: Any, scene: Any, starts: Any, last: Any, shift: Any, border: Any, s: Any, u: Any, v: Any, edge: Any,
     hangs: bool, tiny: bool, caps: Any, number: Any, outlines: Any, later: Any, view: Any, low: Any, high: Any,
-    line: Any, slopes: Any, rays: Any, total: Any, at: Any, slots: Any,
+    line: Any, slopes: Any, rays: Any, at: Any, slots: Any,
 ) -> None:  # fmt: skip
     """Add what those pixels of a row show that have rays of their own to `SHOWN`; and what caps hide of them.
 
-    u, v: column of lane 0, and row. line, slopes: of the row. at, slots: (HOLDS * 16 + 16,) uint32 and (3, HOLDS) int64.
+    Up to four pixels' rays are traced at once. u, v: column of lane 0, and row. line, slopes: of the row. at: (64 +
+    16 HOLDS,) uint32; slots: (HOLDS,) int64.
     """
-    lane = low
-    while lane < high:
-        held = 0
-        while lane < high and held + 1 < HOLDS:
-            j = np.uint64(lane)
-            lane += 1
-            if not has_own(rays, j, tiny):
-                continue
-            rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
-            near, column = rival >= 0 or not rays[ROOM + j] > edge, u + lane - 1
-            form = form_of(column, v, outlines[number], tiny, rival)
-            total[:] = ZERO
+    held, made = 0, 0  # pixels whose boxes have been called for, and others whose rays are set out
+    for lane in range(low, high + 1):
+        j, owns = np.uint64(lane), lane < high and has_own(rays, lane, tiny)
+        rival = np.int64(rays[RIVAL + j]) - 1 if owns else -1
+        if made > 0 and (made == TOGETHER or rival >= 0 or lane == high):
+            trace_own(caps[number], later, view, rays, made * RAYS)
+            boxes_of_rays(outlines[number], last, shift, border, len(starts), rays, made * RAYS, at)
+            for i in range(np.uint64(made)):
+                pixel = np.uint64(slots[np.uint64(held) + i])
+                hold(words, scene, starts, rays, at, LANES * i, LANES * (np.uint64(held) + i), pixel)
+            held, made = held + made, 0
+        if not owns:
+            continue
+        form, at_s = form_of(u + lane, v, outlines[number], tiny, rival), s + np.float32(lane)
+        if rival < 0:
+            near = not rays[ROOM + j] > edge
+            hidden = set_out(
+                at_s, u + lane, v, near, form, number, caps, number, rival, outlines, line, slopes, rays,
+                LANES * np.uint64(made),
+            )  # fmt: skip
+            slots[np.uint64(held + made)] = lane
+            made += 1
+        else:
+            hidden = ZERO
             for which in (number, rival):
-                if which >= 0:
-                    hidden += own_rays(
-                        s + np.float32(np.int32(j)), near, form, which, caps, number, rival, later, view, line, slopes,
-                        rays,
-                    )  # fmt: skip
-                    boxes_of_rays(column, v, outlines[which], last, shift, border, len(starts), rays, at)
-                    hold(words, scene, starts, rays, at, LANES * np.uint64(held + 1), total)
-                    slots[np.uint64(0), np.uint64(held)] = np.int64(j)
-                    held += 1
-            rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
-            k = SHOWN + j + j + j
-            rays[k], rays[k + ONE_], rays[k + TWO_] = total[0], total[1], total[2]
-        for i in range(np.uint64(held)):
-            show_held(words, rays, at, LANES * (i + ONE_), np.uint64(slots[np.uint64(0), i]))
+                hidden += set_out(
+                    at_s, u + lane, v, True, form, which, caps, number, rival, outlines, line, slopes, rays,
+                    np.uint64(0),
+                )  # fmt: skip
+                trace_own(caps[which], later, view, rays, RAYS)
+                boxes_of_rays(outlines[which], last, shift, border, len(starts), rays, RAYS, at)
+                hold(words, scene, starts, rays, at, np.uint64(0), LANES * np.uint64(held), j)
+                slots[np.uint64(held)] = lane
+                held += 1
+        rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
+    for i in range(np.uint64(held)):
+        show_held(words, rays, at, LANES * i, np.uint64(slots[i]))

@@ -7,7 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from .cap_edges import HOLDS, boxes_of_rays, edges_of_words, form_of, has_own, own_rays, slopes_of_row, spread_rays
+from .cap_edges import (
+    HOLDS,
+    RAYS,
+    boxes_of_rays,
+    edges_of_words,
+    form_of,
+    has_own,
+    set_out,
+    slopes_of_row,
+    trace_own,
+)
 from .cap_looks import ROUND, is_whole, whole_of_words
 from .cap_rays import CAP_SQUARE, CLEAR, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
 from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
@@ -59,10 +69,9 @@ def frame(
     height, width = out.shape[0], out.shape[1]
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
     rays, line = np.zeros(PLANES * 64, dtype=np.float32), np.zeros(15, dtype=np.float32)
-    tile, total, at = np.zeros((5, 3, 3), np.float32), np.zeros(4, np.float32), np.zeros(ROUND * 64, np.uint32)
-    slopes = np.zeros(12, dtype=np.float32)
-    spread_rays(rays)
-    quarters, slots = np.zeros(ROUND * 64, np.uint32), np.zeros((3, max(ROUND, HOLDS)), np.int64)
+    tile, slopes, total = np.zeros((5, 3, 3), np.float32), np.zeros(12, np.float32), np.zeros(4, np.float32)
+    at, quarters = np.zeros(64 + HOLDS * RAYS, np.uint32), np.zeros(ROUND * 64, np.uint32)
+    slots, held = np.zeros((3, ROUND), np.int64), np.zeros(HOLDS, np.int64)
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
@@ -116,7 +125,7 @@ def frame(
                         )  # fmt: skip
                     edges_of_words(
                         words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
-                        later, view, low, high, line, slopes, rays, total, at, slots,
+                        later, view, low, high, line, slopes, rays, at, held,
                     )  # fmt: skip
                     write_bytes(out, v, u1, lanes, rays)
 
@@ -152,11 +161,13 @@ def record_row(
             near, form = rival >= 0 or not rays[ROOM + j] > edge, form_of(u + lane, v, outlines[number], tiny, rival)
             for which in (number, rival):
                 if which >= 0:
-                    hidden += own_rays(
-                        s + np.float32(lane), near, form, which, caps, number, rival, later, view, line, slopes, rays
+                    hidden += set_out(
+                        s + np.float32(lane), u + lane, v, near, form, which, caps, number, rival, outlines, line,
+                        slopes, rays, np.uint64(0),
                     )  # fmt: skip
+                    trace_own(caps[which], later, view, rays, RAYS)
                     off |= add_places(rays, shift, last, mean)
-                    boxes_of_rays(u + lane, v, outlines[which], last, shift, border, len(starts), rays, at)
+                    boxes_of_rays(outlines[which], last, shift, border, len(starts), rays, RAYS, at)
                     record_rays(starts, size, rays, at, boxes, texels, weights, cursor, filling)
             rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
         if not rays[HIDDEN + j] > ZERO:

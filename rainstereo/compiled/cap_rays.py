@@ -28,11 +28,11 @@ HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))
 SHOWN, CLEAR = np.uint64(64 * 45), np.uint64(64 * 48)
 """What a row shows, three channels a pixel, and the share that is clear, thrice."""
 WEIGHT, STRETCH = np.uint64(64 * 51), np.uint64(64 * 52)
-PLACES = np.uint64(64 * 53)
-"""Where on a pixel its own rays are: x and y of each of three forms (`cap_edges`)."""
-HELD = np.uint64(64 * 59)
+SPREAD, PER = np.uint64(64 * 53), np.uint64(64 * 54)
+"""Of a pixel's own rays: see `cross`, and how a box's size follows from how far a ray looks (`cap_edges`)."""
+HELD = np.uint64(64 * 55)
 """Weights of rays whose boxes are on their way from memory."""
-PLANES = 71
+PLANES = 83
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
@@ -114,13 +114,13 @@ def room_of_row(line: Any, s: Any, lanes: Any, square: Any, rays: Any) -> None:
 
 
 @fused_part
-def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: Any, soft: bool, spread: Any) -> None:
+def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: Any, soft: bool) -> None:
     """Rays that have been taken up, through the cap, the rest of the chamber and to the scene; written from `to` on.
 
     The gain is 0 where no light comes through. later: (F, 3) float32, thickness before a face and the indices
     on both sides, of the faces behind the cap's.
     soft: each ray stands for light about it, over which the square of the wave vector's component along the normal
-    behind the cap goes from `spread` below to as much above the ray's. That component is what places and gains depend
+    behind the cap goes from `SPREAD` below to as much above the ray's. That component is what places and gains depend
     on, nearly linearly, also where it ends, at the critical angle, and they as steeply as a square root: so its mean
     gives the light's gain, and its mean weighted with itself the light's middle. The plane `STRETCH` gets the component
     before the cap's surface over that behind it.
@@ -129,7 +129,7 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
     n = np.float32(cap[CAP_INDEX])
     q = n * n
     inverse, less = ONE / q, ONE - q
-    third, fourth = ONE / (np.float32(3) * spread), ONE / (FOUR * spread)
+    a_third, a_fourth = np.float32(1 / 3), np.float32(0.25)
     first, last = np.uint64(low), np.uint64(high)
     for j in range(first, last):
         px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
@@ -143,10 +143,12 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
         inside = before * before + less
         turned = mean = np.float32(math.sqrt(inside))
         if soft:
+            spread = rays[SPREAD + j]
+            per = ONE / spread
             high, low_ = inside + spread, inside - spread
             high, low_ = (high if high > ZERO else ZERO), (low_ if low_ > ZERO else ZERO)
-            mean = (high * np.float32(math.sqrt(high)) - low_ * np.float32(math.sqrt(low_))) * third
-            turned = (high + low_) * (high - low_) * fourth / (mean if mean > ZERO else ONE)
+            mean = (high * np.float32(math.sqrt(high)) - low_ * np.float32(math.sqrt(low_))) * (a_third * per)
+            turned = (high + low_) * (high - low_) * (a_fourth * per) / (mean if mean > ZERO else ONE)
             inside = high
         p, t = before + q * turned, before + turned
         both = ONE / (p * t)

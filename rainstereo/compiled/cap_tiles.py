@@ -106,7 +106,7 @@ def trace_lanes(
     of_row(tile, t, line)
     end = low + (high - low + 7) // 8 * 8
     take_up(line, s, low, end, rays)
-    cross(cap, later, view, rays, low, end, to, False, ONE)
+    cross(cap, later, view, rays, low, end, to, False)
 
 
 @fused_part

@@ -225,7 +225,7 @@ def test_boxes_are_means(size, channels):
 def test_loops_know_how_boxes_are_laid_out(size):
     """Own rays compute what a table says of a size: pixels between boxes, and boxes in a row."""
     from rainstereo.compiled.cap_edges import SIZE_BITS, boxes_of_rays
-    from rainstereo.compiled.cap_rays import PLANES, STRETCH, SUB, WEIGHT, Y_
+    from rainstereo.compiled.cap_rays import PER, PLANES, STRETCH, SUB, WEIGHT, Y_
 
     boxes, sizes = Boxes.of(size), set[int]()
     width, height = size
@@ -237,7 +237,8 @@ def test_loops_know_how_boxes_are_laid_out(size):
         planes[int(SUB) // 64, :16], planes[int(SUB + Y_) // 64, :16] = x, y
         planes[int(WEIGHT) // 64, :16], planes[int(STRETCH) // 64, :16] = 1, 10 ** rng.uniform(0, 6, 16)
         last = np.float32(width - 1), np.float32(height - 1)
-        boxes_of_rays(3, 4, np.array([1.0, 2.0]), last, (np.float32(0), np.float32(0)), 0, len(boxes.start), rays, at)
+        planes[int(PER) // 64, :16] = 1e-3
+        boxes_of_rays(np.array([1.0, 2.0]), last, (np.float32(0), np.float32(0)), 0, len(boxes.start), rays, 16, at)
         for box, u, v in zip(at[:16].tolist(), x, y, strict=True):
             size_of_box, number = box >> SIZE_BITS, box & ((1 << SIZE_BITS) - 1)
             if size_of_box == 31:
