@@ -54,7 +54,7 @@ TOGETHER, HOLDS = 4, 112  # pixels whose rays are traced at once, and, at most, 
 FORMS = ((8, 2), (2, 8), (4, 4))
 """Rays along and down a pixel: towards the middle of a cap beside it, above or below it, and in other directions."""
 STEEP = 1.73  # tan of the angle from which it is beside, or above
-WIDER = np.float32(1.6)
+WIDER = np.float32(1.8)
 """Area of a box over that of the part of a patch that a ray stands for."""
 SOFTEST = np.float32(1e-3)  # less is lost in rounding
 SIZE_BITS, NO_BOX = 27, 31

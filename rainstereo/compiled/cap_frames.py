@@ -84,7 +84,7 @@ def frame(
                 reach = (max(lanes, v2 - v1) + 1) // 2
                 u0, v0 = fit(nodes, cap, u1 + lanes // 2, (v1 + v2) // 2, reach, tile)
                 wide, radius = widest(tile), math.sqrt(cap[CAP_SQUARE])
-                edge = 1.45 * radius * wide + wide * wide  # of room: a pixel's corner is 0.71 pixels from its middle
+                edge = np.float32(1.45 * radius * wide + wide * wide)  # of room: a pixel's corner is 0.71 pixels from its middle
                 hangs, tiny = hangs_over(tile, cap, wide, 1.5 * reach), radius < TINY * wide
                 s, known = np.float32(u1) - u0, False
                 following = next_span(tile, np.float32(v1) - v0, s, lanes, cap, edge, line, rays)

@@ -51,7 +51,7 @@ what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0."""
 AREAS, AIMS, FIRSTS, PARTS = range(4)
 """Columns of a table of bands: up to which area of a patch, how many looks it gets, from which grid on, and
 which part of the patch's area a box has."""
-LARGEST = np.float32(90 * 90)
+LARGEST = np.float32(110 * 110)
 """Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
 
 
