@@ -1,8 +1,9 @@
 """Means over squares of an image that overlap, so that the nearest one to any place is nearly centred there.
 
-Box j of a size along an axis is centred on the edge between the pixels t j - 1 and t j, t the pixels between them; beyond
-the image's edges it goes on mirrored, to about a pixel. Three channels of bytes stand in a word of 32 bits, 10 bits
-apart, so that four can be added: small words are read sooner. A size between two others is the mean of both: the square of its width is theirs'.
+Box j of a size along an axis is centred on the edge between the pixels t j - 1 and t j, t the pixels between them;
+beyond the image's edges it goes on mirrored, to about a pixel. Three channels of bytes stand in a word of 32 bits, 10
+bits apart, so that four can be added: small words are read sooner. A size between two others is the mean of both: the
+square of its width is the mean of theirs.
 """
 
 from __future__ import annotations
@@ -18,16 +19,16 @@ FIELD, TWICE = np.uint32(BITS), np.uint32(2 * BITS)
 FIRST = np.uint32((1 << BITS) - 1)
 OUTER, MIDDLE = np.uint64(FIRST | (FIRST << TWICE)), np.uint64(FIRST << FIELD)
 WIDE = 20
-"""Bits of a channel in a word that has been spread: 0 up, the last channel's from 20 and the middle one's from 40 on."""
+"""Bits of a channel in a word that has been spread: the last channel's from 20, the middle one's from 40 on."""
 TO_WIDE = np.uint64(2 * WIDE - BITS)
-EVEN = np.uint32(0x3FFFFFFF & ~((1 << 2 * BITS) + (1 << BITS) + 1))  # all but the last bit of each channel
-LAST = np.uint32((1 << 2 * BITS) + (1 << BITS) + 1)
+LAST = np.uint32((1 << 2 * BITS) + (1 << BITS) + 1)  # bit of each channel
+EVEN = np.uint32(0x3FFFFFFF & ~int(LAST))
 ONE, SHIFT = np.uint64(1), np.uint32(1)
 
 
 @inlined
 def spread(word: Any) -> Any:
-    """A word's channels with room for a million between them: sums and weighted sums of such words are the channels'."""
+    """A word's channels with room for a million each: sums and weighted sums of such words are those of channels."""
     word = np.uint64(word)
     return (word & OUTER) + ((word & MIDDLE) << TO_WIDE)
 

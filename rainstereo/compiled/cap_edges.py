@@ -45,7 +45,7 @@ from .cap_rays import (
     cross,
 )
 from .cap_shares import contact_share, from_rival
-from .cap_tiles import LITS, WHOLE
+from .cap_tiles import LITS
 from .compile import fused, fused_part
 from .prefetch import to_read
 
@@ -102,12 +102,12 @@ def set_out(
     s: Any, u: Any, v: Any, near: bool, form: Any, which: Any, caps: Any, number: Any, rival: Any, outlines: Any,
     line: Any, slopes: Any, rays: Any, first: Any,
 ) -> Any:  # fmt: skip
-    """Take up the rays of one pixel, lanes from `first` on, with the share of the pixel that each stands for. Returns how
-    much of the pixel the cap hides.
+    """Take up the rays of one pixel, lanes from `first` on, with the share of the pixel that each stands for. Returns
+    how much of the pixel the cap hides.
 
     s: pixels from the tile's own along a row; line, slopes: of the row. u, v: in the image. near: whether the contact
-    line may cross the pixel. which: the cap that the rays go through, `number` or `rival` (-1: none); each has the parts
-    of the pixel where it has more room than the other.
+    line may cross the pixel, or other caps are there. which: the cap that the rays go through, `number` or `rival`
+    (-1: none); each has the parts of the pixel where it has more room than the other.
     """
     bits = np.int32(3) if form == 0 else np.int32(1) if form == 1 else np.int32(2)  # of a ray's number: along a row
     mask = np.int32((1 << bits) - 1)
@@ -158,8 +158,8 @@ def set_out(
 
 @fused
 def trace_own(cap: Any, later: Any, view: Any, rays: Any, lanes: Any) -> None:
-    """Rays that were set out, from lane 0 to before `lanes`, to the planes `SUB`; and to `WEIGHT` the gain of each times
-    the share of the pixel that it stands for."""
+    """Rays that were set out, from lane 0 to before `lanes`, to the planes `SUB`; and to `WEIGHT` the gain of each
+    times the share of the pixel that it stands for."""
     cross(cap, later, view, rays, 0, lanes, SUB, True)
     for j in range(np.uint64(lanes)):
         rays[WEIGHT + j] = rays[SUB + GAIN + j] * rays[SHARE + j]
@@ -167,7 +167,7 @@ def trace_own(cap: Any, later: Any, view: Any, rays: Any, lanes: Any) -> None:
 
 @fused_part
 def softness(cap: Any, px: Any, py: Any, kx: Any, ky: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
-    """Half of how much the square of the wave vector's component along a cap's normal changes over a part of a pixel."""
+    """Half of how much the square of the wave vector's component along a cap's normal changes over a pixel's part."""
     q, curvature, depth = np.float32(cap[CAP_INDEX] ** 2), np.float32(cap[CAP_CURVATURE]), np.float32(cap[CAP_DEPTH])
     b = np.float32(math.sqrt(q - kx * kx - ky * ky)) * depth + px * kx + py * ky
     gu, gv = b * (kx * xu + ky * yu) - q * (px * xu + py * yu), b * (kx * xv + ky * yv) - q * (px * xv + py * yv)
@@ -211,8 +211,8 @@ def boxes_of_rays(
 
 @fused_part
 def hold(words: Any, scene: Any, starts: Any, rays: Any, at: Any, first: Any, to: Any, lane: Any) -> None:
-    """Call for the boxes of a pixel's rays, lanes from `first` on, and keep their numbers and weights from `to` on; what
-    rays show that look at the image itself is added to what the pixel of a lane shows at once."""
+    """Call for the boxes of a pixel's rays, lanes from `first` on, and keep their numbers and weights from `to` on;
+    what rays show that look at the image itself is added at once to what the pixel of a lane shows."""
     for j in range(LANES):
         box = np.uint64(at[first + j])
         size = box >> np.uint64(SIZE_BITS)

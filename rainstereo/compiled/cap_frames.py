@@ -59,8 +59,8 @@ def frame(
     mode: DRAW: into `out`, (H, W, C) of up to three channels of bytes, which holds the clear image, from boxes of the
     scene in `words`. COUNT: how many pixels and taps there are, to record's counters. FILL: write them to record.
     scene: (h, w, C) bytes; only its size matters unless drawing. boxes: starts, widths, inverse distances (`boxes`).
-    border, shift: how the scene goes on, and where the frame is in it. looks: grids, how many looks each has, how many of
-    the first look at four boxes each, and bands of areas (`cap_tiles`).
+    border, shift: how the scene goes on, and where the frame is in it. looks: grids, how many looks each has, how many
+    of the first look at four boxes each, and bands of areas (`cap_tiles`).
     nodes, caps, ...: see `cap_rays`, `cap_tiles`.
     record: pixels, caps' numbers, taps a pixel, clear shares, displacements, unknown; texels, weights; counters.
     """
@@ -84,7 +84,9 @@ def frame(
                 reach = (max(lanes, v2 - v1) + 1) // 2
                 u0, v0 = fit(nodes, cap, u1 + lanes // 2, (v1 + v2) // 2, reach, tile)
                 wide, radius = widest(tile), math.sqrt(cap[CAP_SQUARE])
-                edge = np.float32(1.45 * radius * wide + wide * wide)  # of room: a pixel's corner is 0.71 pixels from its middle
+                edge = np.float32(
+                    1.45 * radius * wide + wide * wide
+                )  # of room: a pixel's corner is 0.71 pixels from its middle
                 hangs, tiny = hangs_over(tile, cap, wide, 1.5 * reach), radius < TINY * wide
                 s, known = np.float32(u1) - u0, False
                 following = next_span(tile, np.float32(v1) - v0, s, lanes, cap, edge, line, rays)
@@ -158,7 +160,8 @@ def record_row(
             off = not rays[FAR + j] >= ZERO
         elif low <= lane < high and has_own(rays, lane, tiny):
             rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
-            near, form = rival >= 0 or not rays[ROOM + j] > edge, form_of(u + lane, v, outlines[number], tiny, rival)
+            near = bool(rival >= 0 or not rays[ROOM + j] > edge)
+            form = form_of(u + lane, v, outlines[number], tiny, rival)
             for which in (number, rival):
                 if which >= 0:
                     hidden += set_out(
@@ -191,7 +194,9 @@ def write_bytes(out: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
         for channel in range(three):
             rays[CLEAR + three * j + channel] = ONE - rays[HIDDEN + j]
     if channels == three:
-        count = (three * np.uint64(lanes) + block - np.uint64(1)) // block * block  # whole vectors: beyond, all is clear
+        count = (
+            (three * np.uint64(lanes) + block - np.uint64(1)) // block * block
+        )  # whole vectors: beyond, all is clear
         for k in range(min(count, np.uint64(len(row)) - first)):
             value = rays[SHOWN + k] + rays[CLEAR + k] * np.float32(row[first + k]) + HALF
             row[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))

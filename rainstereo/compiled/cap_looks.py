@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from .cap_rays import FOUR, HALF, HIDDEN, ONE, RIVAL, SHOWN, Y_, ZERO
+from .boxes import channels_of, spread
+from .cap_rays import FOUR, HALF, HIDDEN, ONE, RIVAL, SHOWN, ZERO
 from .cap_tiles import (
     ABX,
     ABY,
@@ -33,7 +34,6 @@ from .cap_tiles import (
     PART,
     WHOLE,
 )  # fmt: skip
-from .boxes import channels_of, spread
 from .compile import fused, fused_part
 from .prefetch import to_read
 
@@ -69,7 +69,7 @@ def folded(at: Any, last: Any, border: Any) -> Any:
 
 @fused_part
 def size_of(square: Any, sizes: Any) -> Any:
-    """The size of boxes for a part of a patch, of this area; -1: the image itself, for a part narrower than 2.4 pixels."""
+    """The size of boxes for a part of a patch, of this area; -1: the image itself, for one narrower than 2.4."""
     octaves = (np.float32(square * SMALLEST).view(np.int32) >> 23) - 127  # of areas: the number's exponent
     return max(min(octaves, sizes - 1), 0) if octaves >= -1 else -1
 
@@ -222,7 +222,13 @@ def whole_of_words(
                     rays[SHOWN + j + j + j + channel] = gain * total[channel]
                 continue
             size, number, first = np.uint64(k), np.uint64(grid), np.uint64(64 * made)
-            start, pitch, one, count, of_grid = starts[size], pitches[size], inverses[size], counts[number], number * OF_GRID
+            start, pitch, one, count, of_grid = (
+                starts[size],
+                pitches[size],
+                inverses[size],
+                counts[number],
+                number * OF_GRID,
+            )
             on = border if not rays[FAR + j] >= ZERO else INSIDE
             if grid < fines:
                 if on == INSIDE:
@@ -245,5 +251,9 @@ def whole_of_words(
         for i in range(np.uint64(made)):
             j, count, pitch = np.uint64(slots[np.uint64(0), i]), slots[ONE_, i], slots[TWO_, i]
             unit = ONE / np.float32(16 * count) if pitch else ONE / np.float32(count)
-            found = sum_of_means(words, pitch, at, parts, np.uint64(64) * i, count) if pitch else sum_of(words, at, np.uint64(64) * i, count)
+            found = (
+                sum_of_means(words, pitch, at, parts, np.uint64(64) * i, count)
+                if pitch
+                else sum_of(words, at, np.uint64(64) * i, count)
+            )
             show(rays, j, found, rays[GAINS + j] * rays[HIDDEN + j] * unit, BIAS / unit)

@@ -49,11 +49,10 @@ def record_whole(
     gain = rays[GAINS + j] * rays[HIDDEN + j]
     if k < 0:
         across, down = sides(rays, j)
-        part = gain / np.float32(across * down)
         for b in range(down):
             for a in range(across):
                 x, y = look_at(rays, j, a, b, across, down, last, border)
-                _bilinear(texels, weights, cursor, filling, first, size, x, y, part)
+                _bilinear(texels, weights, cursor, filling, first, size, x, y, gain / np.float32(across * down))
         return
     start, pitch, inverse, count = starts[k], pitches[k], inverses[k], counts[grid]
     on, part = border if not rays[FAR + j] >= ZERO else INSIDE, gain / np.float32(count)
@@ -62,9 +61,10 @@ def record_whole(
         for look in range(np.uint64(count)):
             box, far = np.int64(at[look]), np.int64(parts[look])
             u, v = np.float32(far & 3) / np.float32(4), np.float32(far >> 2) / np.float32(4)
-            for row, a in ((box, ONE - v), (box + pitch, v)):
-                _tap(texels, weights, cursor, filling, row, part * a * (ONE - u))
-                _tap(texels, weights, cursor, filling, row + 1, part * a * u)
+            _tap(texels, weights, cursor, filling, box, part * (ONE - v) * (ONE - u))
+            _tap(texels, weights, cursor, filling, box + 1, part * (ONE - v) * u)
+            _tap(texels, weights, cursor, filling, box + pitch, part * v * (ONE - u))
+            _tap(texels, weights, cursor, filling, box + pitch + 1, part * v * u)
         return
     places(False, start, pitch, inverse, last, on, rays, j, grids, grid * OF_GRID, count, at, begin, parts)
     for look in range(np.uint64(count)):
@@ -89,7 +89,8 @@ def record_rays(
 
 @fused_part
 def add_places(rays: Any, shift: Any, last: Any, mean: Any) -> bool:
-    """Add the places of a pixel's own rays that show something, and how many, to `mean`; whether one is off the scene."""
+    """Add the places of a pixel's own rays that show something, and how many, to `mean`; say whether one is off the
+    scene."""
     off = False
     for j in range(LANES):
         if rays[WEIGHT + j] > ZERO:

@@ -21,7 +21,6 @@ from .cap_rays import (
     GAIN,
     HALF,
     NEXT,
-    ONE,
     OWN,
     PATCH,
     ROOM,
@@ -132,9 +131,9 @@ def row_of_tile(
     if not low < high:
         return 0, 0
     lit(rays, low, high)
-    while low < high and not rays[LITS + np.uint64(low)] == WHOLE:
+    while low < high and rays[LITS + np.uint64(low)] != WHOLE:
         low += 1
-    while low < high and not rays[LITS + np.uint64(high - 1)] == WHOLE:
+    while low < high and rays[LITS + np.uint64(high - 1)] != WHOLE:
         high -= 1
     if low < high:
         trace_lanes(tile, t, s, low, high, cap, later, view, line, rays, OWN)

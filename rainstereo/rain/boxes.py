@@ -81,7 +81,10 @@ class Boxes:
         for k, apart, step in self.octaves:
             before, larger = self.part(found, k - 2), self.part(found, k)
             own, *parts = (
-                [_mirrored(step * np.arange(n) + far, last - 1) for n, last in zip(larger.shape[:2], before.shape[:2], strict=True)]
+                [
+                    _mirrored(step * np.arange(n) + far, last - 1)
+                    for n, last in zip(larger.shape[:2], before.shape[:2], strict=True)
+                ]
                 for far in (0, -apart, apart)
             )
             rows, columns = zip(*parts, strict=True)

@@ -163,7 +163,9 @@ def test_light_is_kept(drops, limit):
     assert np.abs(found.image - expected)[inside].max() < 15
 
 
-@pytest.mark.parametrize(("radius", "angle", "steps"), [(1.0, 70, (0.0, 1.0)), (0.5, 60, (0.7, 0.7)), (1.3, 80, (1.0, 0.2))])
+@pytest.mark.parametrize(
+    ("radius", "angle", "steps"), [(1.0, 70, (0.0, 1.0)), (0.5, 60, (0.7, 0.7)), (1.3, 80, (1.0, 0.2))]
+)
 def test_own_rays_stand_for_the_light_about_them(radius, angle, steps):
     """Across the line where a cap turns dark: against the mean of 48 x 48 exact rays, weighted with their light."""
     from rainstereo.compiled.cap_edges import RAYS, form_of, set_out, slopes_of_row, trace_own
