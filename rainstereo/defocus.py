@@ -93,6 +93,14 @@ class DefocusedPatch:
         colour[self._coarse_opacity == 0] = 0
         return Layer(*self._window, self._fine(colour), self._opacity)
 
+    @property
+    def opacity(self) -> tuple[slice, slice, Array]:
+        """Rows and columns of the image, and the opacity there: that of every layer, without its colours."""
+        if self.sharp or not self.patch.opacity.size:
+            layer = self.patch.layer(np.zeros(self.size[::-1], dtype=np.uint8), self.border)
+            return layer.rows, layer.columns, layer.opacity
+        return *self._window, self._opacity
+
     # -- the plan, made for the first frame ------------------------------------------------------------------------
 
     @cached_property
@@ -211,14 +219,14 @@ def defocused(
     blurred at every pixel, scattered drops are better given one by one.
     """
     everyone = [drops] if isinstance(drops, Drop) else list(drops)
-    distances = [apparent_distance(drop, chamber) for drop in everyone]
-    discs = [lens.blur(distance, camera) for distance in distances]
+    distances = apparent_distances(everyone, chamber)
+    discs = [lens.blur(distance, camera) for distance in distances.tolist()]
     if discs and max(discs) > max(SAME * min(discs), min(discs) + SHARP):
         raise ValueError(
             f"the drops are blurred by discs of {min(discs):.3g} to {max(discs):.3g} px; one layer has one disc. Group "
             "the drops by distance and make a layer of each group, the farthest first"
         )
-    distance = float(np.mean(distances)) if distances else lens.focus
+    distance = float(np.mean(distances)) if len(distances) else lens.focus
     diameter = lens.blur(distance, camera)
     if diameter < SHARP:
         patch = Patch.trace(everyone, camera, chamber, depth, density=1.0 if density is None else density)
@@ -242,17 +250,30 @@ def apparent_distance(drop: Drop, chamber: Chamber) -> float:
     Panels before it bring it nearer, each by its thickness times (1 - 1/n) along the normal: the shift of an image seen
     through a plate, for rays close to the normal. ValueError for a drop behind the camera.
     """
+    return float(apparent_distances([drop], chamber)[0])
+
+
+def apparent_distances(drops: Sequence[Drop], chamber: Chamber, *, behind: bool = False) -> Array:
+    """The same of many drops, (N,); behind: whether some may lie behind the camera, whose distance is then below 0."""
     frame = PanelFrame.of(chamber)
-    base = frame.base(chamber, drop.centre, drop.panel, drop.face)
-    crossed = chamber.panels[: drop.panel + (drop.face == "far")]
-    base[2] -= sum(panel.thickness * (1 - 1 / panel.index) for panel in crossed)
-    distance = float(frame.to_camera(base)[2])
-    if not distance > 0:
-        raise ValueError(
-            f"the drop at {drop.centre} on panel {drop.panel} lies {-distance:.4g} m behind the camera, where it has "
-            "no blur; leave out drops that the camera cannot see"
-        )
-    return distance
+    towards = frame.R_panel_cam[:, 2]  # the camera's z axis
+    places = {(drop.panel, drop.face) for drop in drops}
+    faces = {}
+    for panel, face in places:
+        crossed = chamber.panels[: panel + (face == "far")]
+        base = frame.base(chamber, (0.0, 0.0), panel, face)
+        base[2] -= sum(panel.thickness * (1 - 1 / panel.index) for panel in crossed)
+        faces[panel, face] = base
+    found = np.empty(len(drops))
+    for i, drop in enumerate(drops):
+        x, y, z = faces[drop.panel, drop.face].tolist()
+        found[i] = (x + drop.centre[0]) * towards[0] + (y + drop.centre[1]) * towards[1] + z * towards[2]
+        if not (behind or found[i] > 0):
+            raise ValueError(
+                f"the drop at {drop.centre} on panel {drop.panel} lies {-found[i]:.4g} m behind the camera, where it "
+                "has no blur; leave out drops that the camera cannot see"
+            )
+    return found
 
 
 def spacings(diameter: float, density: float | None = None) -> tuple[float, int]:
@@ -319,12 +340,10 @@ def add_blurred(total: Image, samples: Image, kernel: Array) -> None:
 
 def _window(drops: Sequence[Drop], camera: Camera, chamber: Chamber, radius: float, step: int) -> tuple[slice, slice]:
     """Rows and columns that hold the blurred drops, whole steps long; beyond the image as far as blur comes from."""
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for drop in drops:
-        pixels = footprint.outline(drop, camera, chamber)
-        seen = np.isfinite(pixels).all()
-        low = np.minimum(low, pixels.min((0, 1)) if seen else 0)
-        high = np.maximum(high, pixels.max((0, 1)) if seen else np.array(camera.size) - 1)
+    lows, highs = footprint.extents(drops, camera, chamber)
+    seen = (np.isfinite(lows) & np.isfinite(highs)).all(1)[:, None]
+    low = np.where(seen, lows, 0).min(0, initial=np.inf)
+    high = np.where(seen, highs, np.array(camera.size) - 1).max(0, initial=-np.inf)
     margin = radius + 2 * step  # of which a step for the average and one for the interpolation
     size = np.array(camera.size)
     first = np.floor(np.clip(low - margin, -margin, size + margin)).astype(int)

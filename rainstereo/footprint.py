@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from .types import Array
 
 AROUND = 64
 HEIGHTS = 5
+TOGETHER = 64  # drops whose outlines are found at a time
 
 
 def outline(drop: Drop, camera: Camera, chamber: Chamber) -> Array:
@@ -31,6 +33,29 @@ def outline(drop: Drop, camera: Camera, chamber: Chamber) -> Array:
     points = frame.base(chamber, drop.centre, drop.panel, drop.face) + np.stack([x, y, z], -1)
     pixels, _ = project(frame.to_camera(points), camera, chamber)
     return pixels
+
+
+def extents(drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> tuple[Array, Array]:
+    """Least and largest pixel, (N, 2) each, of the outlines of many drops; NaN for one of which a part has no image."""
+    for drop in drops:
+        drop.check_fits(chamber)
+    frame = PanelFrame.of(chamber)
+    places = {(drop.panel, drop.face) for drop in drops}
+    faces = {place: frame.base(chamber, (0.0, 0.0), *place) for place in places}
+    phi = np.linspace(0, 2 * math.pi, AROUND, endpoint=False)
+    ring = np.stack([np.cos(phi), np.sin(phi)], -1) / math.cos(math.pi / AROUND)
+    low, high = np.empty((2, len(drops), 2))
+    for first in range(0, len(drops), TOGETHER):
+        some = drops[first : first + TOGETHER]
+        base = np.array([faces[drop.panel, drop.face] for drop in some])
+        base[:, :2] += [drop.centre for drop in some]
+        tall = np.array([drop.top if drop.face == "far" else -drop.top for drop in some])
+        points = np.broadcast_to(base[:, None, None], (len(some), HEIGHTS, AROUND, 3)).copy()
+        points[..., :2] += np.array([drop.reach for drop in some])[:, None, None, None] * ring
+        points[..., 2] += (tall[:, None] * np.linspace(0, 1, HEIGHTS))[:, :, None]
+        pixels = project(frame.to_camera(points.reshape(-1, 3)), camera, chamber)[0].reshape(len(some), -1, 2)
+        low[first : first + TOGETHER], high[first : first + TOGETHER] = pixels.min(1), pixels.max(1)
+    return low, high
 
 
 def window(drop: Drop, camera: Camera, chamber: Chamber, margin: float = 0.0) -> tuple[slice, slice]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
 
 from .droplet import Drop, is_convex_hull
 from .types import Array, Indices, Mask
@@ -159,6 +158,8 @@ class HeightMap(Drop):
         h = self.heights / self.spacing
         F = np.zeros((4, 4, len(rows) - 1, len(columns) - 1))
         if self.interpolation == "bicubic":
+            from scipy.interpolate import RectBivariateSpline  # dear to import: by those only who need it
+
             spline = RectBivariateSpline(rows, columns, h)
             to_polynomial = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]], dtype=np.float64)
             for dv in (0, 1):

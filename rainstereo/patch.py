@@ -252,6 +252,17 @@ def folded_along(values: Array, last: Any, border: str = "mirror") -> Array:
     return inside
 
 
+def turned_along(values: Array, last: Any, border: str = "mirror") -> Array:
+    """How far `folded_along` moves a coordinate for a step of 1 of the one given: 1, -1 where it is reflected, or 0."""
+    end = np.asarray(last, dtype=np.float32)
+    if border == "mirror":
+        period = np.maximum(2 * end, np.float32(1))
+        turned: Array = np.where((np.abs(values) % period > end) != (values < 0), np.float32(-1), np.float32(1))
+        return turned
+    inside: Array = ((values >= 0) & (values <= end)).astype(np.float32)
+    return inside
+
+
 def resampled(values: Array, density: float, height: int, width: int) -> Array:
     """Samples, (h', w'[, C]) float32, averaged or interpolated to pixels, (height, width[, C])."""
     pixels = ratio(density)[1]

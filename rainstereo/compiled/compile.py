@@ -46,6 +46,11 @@ def compiled(loop: Loop, settings: dict[str, Any] = SETTINGS) -> Loop:
     return cast(Loop, found)
 
 
+def folder() -> Path:
+    """Where machine code is kept, if it can be."""
+    return Path(cast(Any, numba.config).CACHE_DIR or _kept())
+
+
 def _kept() -> Path:
     """A folder for the machine code of these very sources: numba compiles anew when a loop's own file changes, but not
     when a part of it does that another file holds."""

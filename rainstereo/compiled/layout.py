@@ -1,6 +1,6 @@
 """Numbers that loops share with their counterparts in numpy; part of the machine code, so they stand in this folder.
 
-A word of 64 bits holds three bytes, 21 bits apart (`rain.words`).
+A word of 64 bits holds three bytes, 21 bits apart (`rain.words`); a quad, of 32 bits, up to four (`compiled.quads`).
 """
 
 FIELD = 21  # bits of a channel in a word
@@ -11,3 +11,6 @@ QUARTERS, COLUMNS, ROWS = 0, 1, 2
 """How a copy of an image is made of another: means over 2 x 2 texels, over pairs of columns, over pairs of rows."""
 DRAW, COUNT, FILL = 0, 1, 2
 """What the loops over caps do: draw a frame, count its pixels and taps, or write them down."""
+LANES = 8  # pixels whose taps are summed together
+SHORT_BITS, LONG_BITS = 20, 32  # of a place, the lowest, where a tap has 32 bits, and where it has 64
+PLACE = 10  # bits of a texel's place in a window (`rain.windows`)

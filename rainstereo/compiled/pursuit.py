@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .compile import compiled
+from .compile import compiled, inlined
 
 U = np.uint64
 FAR = np.float32(np.inf)
@@ -15,7 +15,8 @@ FAR = np.float32(np.inf)
 @compiled
 def choose(
     lags: Any, gram: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int, fewer: int, negative: float,
-    ridge: float, grows: float, first: Any, where: Any, share: Any, boxes: Any, texel: Any, weight: Any, counts: Any,
+    ridge: float, grows: float, around: int, first: Any, rays: Any, parts: Any, fine: Any, last: Any, mirrored: bool,
+    texel: Any, weight: Any, counts: Any,
 ) -> None:  # fmt: skip
     """Write texels and their weights, (M, MOST) int64, float64, and how many, (M,).
 
@@ -24,28 +25,33 @@ def choose(
     copy, which is empty if none is offered. price, least: (A,) float32: what a texel must be worth, and what must be
     news of its variance. After so many texels (`screened`) only `fewer` others, those worth most then, are offered.
     negative, ridge, grows: what weights below 0 may add up to, and what their square sum costs, more and more, where it
-    is more. first: (2, M) column and row of the windows. where, share: (M, K) places of rays in windows, and their
-    weights. boxes: (M, 4) columns and rows near.
+    is more. around: texels around the rays that are near. first: (2, M) column and row of the windows. rays, parts,
+    fine, last, mirrored: see `points`; rays are those of all pixels, (M, 7, K).
     """
-    size, most, rays = U(len(atoms)), U(texel.shape[1]), U(where.shape[1])
+    size, most, room = U(len(atoms)), U(texel.shape[1]), U(rays.shape[2] * len(parts) ** 2)
     side = U(lags.shape[2] + 1) // U(2)
     along, common = np.empty(size, np.float32), np.zeros((side, side), np.float32)
     columns, rest, news = np.empty(size, np.uint32), np.empty(size, np.float32), np.empty(size, np.float32)
     cost, low, score = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     order = score.view(np.int32)  # as the numbers, which are not negative
     base, bases = np.empty(size, np.float32), np.empty((most, size), np.float32)
-    taken, starts = np.empty(most, np.uint64), np.empty(rays + U(4), np.int64)
-    weights = np.empty(rays + U(4), np.float32)
+    taken, starts = np.empty(most, np.uint64), np.empty(room + U(4), np.int64)
+    weights, box = np.empty(room + U(4), np.float32), np.empty(4, np.int64)
+    where, share = np.empty(room, np.int64), np.empty(room, np.float32)
     wide = np.empty(side * U(lags.shape[2]), np.float32)
-    for pixel in range(U(len(where))):
-        correlate(lags, where[pixel], share[pixel], boxes[pixel], starts, weights, common, wide)
+    for pixel in range(U(len(rays))):
+        lit, total = points(
+            rays[pixel], parts, fine, last, mirrored, first[U(0), pixel], first[U(1), pixel], U(len(lags)), side,
+            around, where, share, box,
+        )  # fmt: skip
+        correlate(lags, where[:lit], share[:lit], box, starts, weights, common, wide)
         add(common, shapes, along)
         there = U(0)
         for i in range(size):
             shape, j, k = U(atoms[i, U(0)]), atoms[i, U(1)], atoms[i, U(2)]
             across, down = shapes[shape, U(0)], shapes[shape, U(1)]
-            near = (j << across) <= boxes[pixel, U(1)] and ((j + 1) << across) > boxes[pixel, U(0)]
-            near = near and (k << down) <= boxes[pixel, U(3)] and ((k + 1) << down) > boxes[pixel, U(2)]
+            near = (j << across) <= box[U(1)] and ((j + 1) << across) > box[U(0)]
+            near = near and (k << down) <= box[U(3)] and ((k + 1) << down) > box[U(2)]
             x, y = (first[U(0), pixel] >> across) + j, (first[U(1), pixel] >> down) + k
             if near and x < shapes[shape, U(2)] and y < shapes[shape, U(3)]:
                 columns[there], rest[there], news[there] = i, along[i], gram[i, i]
@@ -84,9 +90,6 @@ def choose(
                 rest[i] -= gone * own
                 left = news[i] - own * own
                 news[i] = left if left > low[i] else FAR
-        total: Any = 0.0
-        for ray in range(rays):
-            total += np.float64(share[pixel, ray])
         toll = 0.0
         while True:
             solve(gram, along, taken, count, total, toll, weight[pixel])
@@ -103,6 +106,51 @@ def choose(
             x = (first[U(0), pixel] >> shapes[shape, U(0)]) + atoms[i, U(1)]
             y = (first[U(1), pixel] >> shapes[shape, U(1)]) + atoms[i, U(2)]
             texel[pixel, number] = shapes[shape, U(4)] + y * shapes[shape, U(2)] + x
+
+
+@inlined
+def bin_of(at: Any, right: Any, below: Any, a: Any, b: Any, last: Any, mirrored: bool, fine: Any, start: Any) -> Any:
+    """A coordinate of a point of a ray's part of a pixel, in bins from the window's first; see `points`."""
+    at = at + a * right + b * below
+    if mirrored:
+        at = last - abs(last - abs(at) % max(last + last, np.float32(1)))
+    return np.float64((min(max(at, np.float32(0)), last) + np.float32(0.5)) * fine) - start
+
+
+@compiled
+def points(
+    rays: Any, parts: Any, fine: Any, last: Any, mirrored: bool, column: Any, row: Any, bins: Any, side: Any,
+    around: int, where: Any, share: Any, box: Any,
+) -> Any:  # fmt: skip
+    """Write the bins, in a window, of points of a pixel's rays, and their weights; returns how many, and the weight.
+
+    rays: (7, K) float32 x and y in the image, steps of x and y to the next ray right and below, and weights. parts:
+    places of points along a ray's part of the pixel. fine: bins along a pixel of the image. last, mirrored: the last
+    pixel's coordinates, and how the image goes on. column, row: of the window's first texel; it has side x side, with
+    bins x bins each. where, share: room. box: (4,) first and last column and row of the texels that are met, and some
+    (around) more.
+    """
+    count, most, total = U(0), np.float64(bins * side - U(1)), 0.0
+    part = np.float32(1 / len(parts) ** 2)
+    left, top = np.float64(np.int64(column) * np.int64(bins)), np.float64(np.int64(row) * np.int64(bins))
+    box[0], box[1], box[2], box[3] = side, -1, side, -1
+    for a in parts:
+        for b in parts:
+            for ray in range(U(rays.shape[1])):
+                weight = part * rays[U(6), ray]
+                if not weight > 0:
+                    continue
+                x = bin_of(rays[U(0), ray], rays[U(2), ray], rays[U(4), ray], a, b, last[0], mirrored, fine, left)
+                y = bin_of(rays[U(1), ray], rays[U(3), ray], rays[U(5), ray], a, b, last[1], mirrored, fine, top)
+                j, i = np.int64(min(max(x, 0.0), most)), np.int64(min(max(y, 0.0), most))
+                where[count], share[count] = i * np.int64(bins * side) + j, weight
+                count += U(1)
+                total += np.float64(weight)
+                j, i = j // np.int64(bins), i // np.int64(bins)
+                box[0], box[1] = min(box[0], j), max(box[1], j)
+                box[2], box[3] = min(box[2], i), max(box[3], i)
+    box[0], box[1], box[2], box[3] = box[0] - around, box[1] + around, box[2] - around, box[3] + around
+    return count, total
 
 
 @compiled

@@ -10,10 +10,9 @@ import numpy as np
 
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
-from rainstereo.defocus import SAME, DefocusedPatch, apparent_distance, defocused
+from rainstereo.defocus import SAME, DefocusedPatch, apparent_distances, defocused
 from rainstereo.droplet import Drop
 from rainstereo.layer import Layer
-from rainstereo.panel_plane import PanelFrame
 from rainstereo.patch import resampled, sample_pixels
 from rainstereo.thin_lens import ThinLens
 from rainstereo.types import Array, Image, Mask
@@ -78,12 +77,10 @@ class BlurredLayer:
             outer.append(slice(first - part.start, end - part.start))
         return (inner[0], inner[1]), (outer[0], outer[1])
 
-    @cached_property
+    @property
     def opacity(self) -> tuple[slice, slice, Array]:
         """Rows and columns of the frame, and the opacity there."""
-        width, height = self.patch.size
-        layer = self.patch.layer(np.zeros((height, width), dtype=np.uint8))
-        return layer.rows, layer.columns, layer.opacity
+        return self.patch.opacity
 
     def _fine(self, values: Array) -> Array:
         """Values of the patch's samples at the pixels of the frame."""
@@ -122,8 +119,9 @@ def by_disc(
 
     Drops behind the camera are left out.
     """
-    drops = [drop for drop in drops if _is_ahead(drop, chamber)]
-    discs = [lens.blur(apparent_distance(drop, chamber), camera) for drop in drops]
+    distances = apparent_distances(drops, chamber, behind=True)
+    drops = [drops[i] for i in np.flatnonzero(distances > 0).tolist()]
+    discs = [lens.blur(distance, camera) for distance in distances[distances > 0].tolist()]
     places = [(drop.panel, drop.face == "far") for drop in drops]
     sharp = [drop for drop, disc in zip(drops, discs, strict=True) if disc < SHARPEST]
     order = sorted((i for i, disc in enumerate(discs) if disc >= SHARPEST), key=lambda i: (places[i], discs[i]))
@@ -135,8 +133,3 @@ def by_disc(
         else:
             layers.append([i])
     return sharp, [tuple(drops[i] for i in sorted(layer)) for layer in reversed(layers)]
-
-
-def _is_ahead(drop: Drop, chamber: Chamber) -> bool:
-    frame = PanelFrame.of(chamber)
-    return bool(frame.to_camera(frame.base(chamber, drop.centre, drop.panel, drop.face))[2] > 0)

@@ -10,7 +10,6 @@ summed (`paste`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -20,8 +19,10 @@ from rainstereo import compiled
 from rainstereo.types import Array, Indices, Mask
 
 from .quadtree import Taps
+from .windows import Column, PairTaps, WindowTaps
 
 JOINED = 1 << 20  # taps up to which tables are joined: both stand in memory meanwhile
+ROW = 8  # taps that the rest of a row is as dear as
 ROWS = 1 << 14  # that are moved at a time
 TILE = 64  # pixels of the scene
 BITS = 10  # of the number of a tile, along an axis
@@ -32,7 +33,8 @@ class Lookups:
     """Pixels and their taps.
 
     pixels: (M,) int32 numbers of pixels, row by row. groups: (M,) int32, of the drops that were traced together.
-    counts: (M,) int32 of taps. texels: (T,) int32, `pyramid.copy_starts`. weights: (T,) int16, in 1/`UNIT`.
+    counts: (M,) int32 of taps. texels: (T,) int32, `pyramid.copy_starts`. weights: (T,) int16, in 1/`UNIT`; both are
+    arrays, or, in half the memory, the columns of `windows` that give them slice by slice.
     clear: (M,) float32. displacement: (M, 2) float32, pixels, from the pixel to the mean of what it looks at; NaN where
     it is dark. unknown: (M,) whether a ray falls beyond the image that holds the scene.
     """
@@ -56,17 +58,22 @@ class Lookups:
             clear.astype(np.float32), displacement.astype(np.float32), unknown,
         )  # fmt: skip
 
+    @property
+    def size(self) -> int:
+        """How much it takes to hold and to order the table, in taps."""
+        return len(self.texels) + ROW * len(self.pixels)
+
     @classmethod
     def joined(cls, parts: list[Lookups], most: int = JOINED) -> list[Lookups]:
-        """The same in few tables, of so many taps at most; empties the list, to spare memory."""
+        """The same in few tables of such a `size` at most; empties the list, to spare memory."""
         tables: list[Lookups] = []
         parts.reverse()
         while parts:
             same = [parts.pop()]
-            taps = len(same[0].texels)
-            while parts and taps + len(parts[-1].texels) <= most:
+            size = same[0].size
+            while parts and size + parts[-1].size <= most:
                 same.append(parts.pop())
-                taps += len(same[-1].texels)
+                size += same[-1].size
             tables.append(same[0] if len(same) == 1 else _joined(same))
         return tables
 
@@ -75,6 +82,27 @@ class Lookups:
         keep = np.isin(self.groups, groups)
         if keep.all():
             return self
+        kept, held = self.of_rows(keep), getattr(self.texels, "taps", None)
+        if isinstance(held, WindowTaps):
+            return kept.narrow(held.size)[0]
+        return kept if held is None else kept.paired()
+
+    def narrow(self, size: tuple[int, int]) -> tuple[Lookups, Lookups]:
+        """The rows whose taps fit into windows, held so, and the others. size: (width, height) of the scene's image."""
+        if isinstance(self.texels, Column):
+            return self, self.of_rows(np.zeros(len(self.pixels), dtype=np.bool_))
+        taps, fits = WindowTaps.of(size, self.counts, self.texels, self.weights)
+        held = {name: a if fits.all() else a[fits] for name, a in self.columns() if name not in OF_TAPS}
+        held |= {name: Column(taps, name) for name in OF_TAPS}
+        return Lookups(**held | {"counts": taps.counts}), self.of_rows(~fits)
+
+    def paired(self) -> Lookups:
+        """The same, each texel and its weight in one number, if they fit."""
+        taps = None if isinstance(self.texels, Column) else PairTaps.of(self.texels, self.weights)
+        return self if taps is None else replace(self, texels=Column(taps, "texels"), weights=Column(taps, "weights"))
+
+    def of_rows(self, keep: Mask) -> Lookups:
+        """Some of the rows."""
         taps = np.repeat(keep, self.counts)
         return Lookups(*(a[taps] if name in OF_TAPS else a[keep] for name, a in self.columns()))
 
@@ -114,8 +142,11 @@ class Lookups:
 OF_TAPS = ("texels", "weights")
 
 
-def _joined(same: Sequence[Lookups]) -> Lookups:
-    return Lookups(*(np.concatenate([getattr(part, name) for part in same]) for name, _ in same[0].columns()))
+def _joined(same: list[Lookups]) -> Lookups:
+    """One table of several; empties the list, so that each column is there twice only while it is copied."""
+    columns = {f.name: [getattr(part, f.name) for part in same] for f in fields(Lookups)}
+    same.clear()
+    return Lookups(**{name: np.concatenate(columns.pop(name)) for name in list(columns)})
 
 
 def _along_curve(column: Indices, row: Indices) -> Indices:

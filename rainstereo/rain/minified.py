@@ -2,7 +2,9 @@
 
 A drop shows the scene small: neighbouring pixels may look 50 pixels apart. A pixel's value is the mean over its area,
 taken here from `rays_along` squared rays, each of which stands for its part of the area (`pursuit`, `quadtree`). Two
-rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more.
+rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more. In plans that
+last there are twice as many along a side at the outline of a drop, since they also tell how much of the pixel the drop
+hides: of 8 x 8 that share is wrong by 0.013 or so, which is more gray levels than all else.
 """
 
 from __future__ import annotations
@@ -20,29 +22,32 @@ from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
 from rainstereo.drop_grid import NOBODY
 from rainstereo.droplet import Drop
-from rainstereo.patch import LONGEST, Patch, folded_along
+from rainstereo.patch import LONGEST, Patch
 from rainstereo.trace import BLOCK, clear_transmittance, trace
 from rainstereo.types import Array, Image, Indices, Mask, Status
 
 from .free_memory import give_back
 from .lookups import JOINED, Lookups
-from .pursuit import Pursuit
+from .pursuit import Pursuit, forget
 from .quadtree import Quadtree
 from .samples import Samples
 
 RAYS = 2  # along a pixel's side, to begin with
 CHUNK = 4096  # pixels traced at a time with all their rays
 TOGETHER = 1 << 16  # pixels that are held at a time
+MANY = 1 << 17  # pixels of a plan whose loops are compiled before its tables take memory
+OUTLINE = 2
+"""Times as many rays along a side at the outline of a drop, for plans that last."""
 CLEAR_STEP = 8
-LARGE = 1 << 22  # taps of a table that lasts
+LARGE = 1 << 22  # taps of a plan beyond which they are held in less memory, for a little more time in each frame
 NOTHING, DARK, LIT = 0, 1, 2  # of a pixel
 EXTENTS = ((0.75, 33), (2.5, 17), (6.0, 9), (60.0, 5), (math.inf, 3))
 """Texels that a pixel may span, up to a tolerance."""
 WORTH = 0.003
 """Of a texel that is saved, in square gray levels, at a tolerance of 1 gray level; as its square. With this, drops are
-within the tolerance of 64 rays a pixel, which are themselves wrong by 0.6 to 0.8 gray levels, and of 576."""
-EACH = 0.07
-"""The same of a texel more in `Pursuit`."""
+within the tolerance of 64 rays a pixel, which are themselves wrong by 0.6 to 0.8 gray levels, and of 1024."""
+FINER_WORTH, EACH = 0.008, 0.22
+"""The same in plans that last, and of a texel more in `Pursuit`: within the tolerance of 1024 rays a pixel."""
 DEAREST = 4.0
 STRICT = 0.9
 """Gray levels: for tolerances below, there is only the tree, whose windows are finer."""
@@ -108,26 +113,45 @@ class Minifier:
         """What every pixel of the batches that a drop covers looks at."""
         tables: list[Lookups] = []
         small: list[Lookups] = []
-        taps = every = 0
+        wide: list[Lookups] = []
+        size = every = 0
+        if sum(len(batch.pixels) for batch in batches) > MANY:
+            from .compile_ahead import compile_ahead  # which needs `paste`
+
+            compile_ahead(self.lasting)
         for table in self._one_by_one(batches):
             every += len(table.texels)
-            if taps + len(table.texels) > self._joined:  # before the next ones come: the memory of these serves them
+            if size + table.size > JOINED:  # before the next ones come: the memory of these serves them
                 tables += self._ordered(small)
-                taps = 0
+                size = 0
+                if every > LARGE:
+                    self._narrow(tables, wide)
+                    give_back()
             small.append(table)
-            taps += len(table.texels)
+            size += table.size
         tables += self._ordered(small)
         if every > LARGE:
+            self._narrow(tables, wide)
+            tables += [table.paired() for table in self._ordered(wide)]
+            forget()
             give_back()
         return tables
 
-    def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
-        return [table.ordered(self.camera.width) for table in Lookups.joined(tables, self._joined)]
+    def _narrow(self, tables: list[Lookups], wide: list[Lookups]) -> None:
+        """Hold tables in less memory. wide: what takes more, and is waiting until it is many."""
+        for i, table in enumerate(tables):
+            if self.lasting:  # with texels and weights that windows do not have
+                tables[i] = table.paired()
+                continue
+            tables[i], rest = table.narrow(self.source_size)
+            if len(rest.pixels):
+                wide.append(rest)
+        if sum(table.size for table in wide) > JOINED:
+            tables += [table.paired() for table in self._ordered(wide)]
+            wide.clear()
 
-    @property
-    def _joined(self) -> int:
-        """Taps up to which tables are joined: the more, the better their order serves the caches."""
-        return LARGE if self.lasting else JOINED
+    def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
+        return [table.ordered(self.camera.width) for table in Lookups.joined(tables)]
 
     def _one_by_one(self, batches: Sequence[Batch]) -> Iterator[Lookups]:
         """Tables of a few thousand pixels each; none is empty."""
@@ -147,14 +171,19 @@ class Minifier:
             return
         kinds = [_kind(self.traced(batch, RAYS)) for batch in batches]
         ends = np.cumsum([len(kind) for kind in kinds])[:-1]
-        edges = np.split(self.edges(np.concatenate([b.pixels for b in batches]), np.concatenate(kinds)), ends)
-        for batch, kind, edge in zip(batches, kinds, edges, strict=True):
-            rows = np.flatnonzero(edge | (kind == LIT))
-            for first in range(0, len(rows), CHUNK):
-                part = rows[first : first + CHUNK]
-                yield self._look(batch, part, self.traced(batch, side, part))
+        pixels = np.concatenate([batch.pixels for batch in batches])
+        edges, outlines = (np.split(found, ends) for found in self.edges(pixels, np.concatenate(kinds)))
+        for batch, kind, edge, outline in zip(batches, kinds, edges, outlines, strict=True):
+            fine = outline & self.lasting
+            for some, more in ((~fine & (edge | (kind == LIT)), 1), (fine, OUTLINE)):
+                rows = np.flatnonzero(some)
+                for first in range(0, len(rows), CHUNK // more**2):
+                    part = rows[first : first + CHUNK // more**2]
+                    yield self._look(batch, part, self.traced(batch, more * side, part))
             dark = np.flatnonzero(~edge & (kind == DARK))
-            yield self._look(batch, dark, _darkness(len(dark)))
+            for first in range(0, len(dark), TOGETHER):
+                part = dark[first : first + TOGETHER]
+                yield self._look(batch, part, _darkness(len(part)))
 
     # -- tracing -------------------------------------------------------------------------------------------------------
 
@@ -185,14 +214,17 @@ class Minifier:
             opacity[:, part] = found.opacity[:, :count]
         return Samples(source, gain, opacity)
 
-    def edges(self, pixels: Indices, kinds: Status) -> Mask:
-        """Which pixels show something else than their neighbours; kinds: (M,), 0 for nothing."""
+    def edges(self, pixels: Indices, kinds: Status) -> tuple[Mask, Mask]:
+        """Which pixels show something else than their neighbours, and which are so at the outline of a drop.
+
+        kinds: (M,), 0 for nothing.
+        """
         width, height = self.camera.size
         of_frame: Status = np.full((height, width), NOTHING, dtype=np.uint8)
         of_frame.ravel()[pixels] = kinds
         around = np.ones((3, 3), dtype=np.uint8)
-        rough = cv2.dilate(of_frame, around) != cv2.erode(of_frame, around)
-        return np.asarray(rough.ravel()[pixels])
+        least, most = (reach(of_frame, around).ravel()[pixels] for reach in (cv2.erode, cv2.dilate))
+        return least != most, (least == NOTHING) & (most != NOTHING)
 
     # -- taps ----------------------------------------------------------------------------------------------------------
 
@@ -213,17 +245,18 @@ class Minifier:
             with np.errstate(invalid="ignore", divide="ignore"):
                 displacement.append(np.where(number > 0, total / number, np.nan) - own)
             at = looked + np.float32(self.shift[axis])
-            last = self.source_size[axis] - 1
-            unknown |= (((at < 0) | (at > last)) & lit).any(0)
-            places.append(folded_along(at, last, self.border))
+            unknown |= (((at < 0) | (at > self.source_size[axis] - 1)) & lit).any(0)
+            places.append(at)
         taps = self._sums.taps(places[0], places[1], samples.gain * np.float32(1 / rays))
         return Lookups.of(pixels, batch.groups[rows], taps, 1 - covered / rays, np.stack(displacement, -1), unknown)
 
     @cached_property
     def _sums(self) -> Pursuit | Quadtree:
         extent = next(extent for tolerance, extent in EXTENTS if self.tolerance <= tolerance)
-        tree = Quadtree(self.source_size, extent, min(WORTH * self.tolerance**2, DEAREST))
-        if not self.lasting or not STRICT <= self.tolerance < math.inf:
+        pursued = self.lasting and STRICT <= self.tolerance < math.inf
+        worth = FINER_WORTH if pursued else WORTH
+        tree = Quadtree(self.source_size, extent, min(worth * self.tolerance**2, DEAREST), self.border)
+        if not pursued:
             return tree
         return Pursuit(self.source_size, min(EACH * self.tolerance**2, DEAREST), tree)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from .contacts import clusters, touching
 
 AROUND = 16
 HEIGHTS = 2
+BLOCK = 4096  # drops whose circles are found at a time
 MARGIN = 2.5
 """Pixels around a drop that are its own too: a ring without any of it, so that two groups share no pixel."""
 
@@ -38,9 +40,13 @@ class Outlines:
     @classmethod
     def of(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> Outlines:
         """The circles of drops, as a pinhole at the camera's centre sees them."""
-        if not drops:
-            nowhere = np.zeros(0)
-            return cls(nowhere, nowhere, nowhere, camera.size)
+        nowhere = np.zeros(0)
+        blocks = (drops[first : first + BLOCK] for first in range(0, len(drops), BLOCK))
+        parts = [cls._of_some(some, camera, chamber) for some in blocks]
+        return cls.joined([cls(nowhere, nowhere, nowhere, camera.size), *parts])
+
+    @classmethod
+    def _of_some(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> Outlines:
         frame = PanelFrame.of(chamber)
         phi = np.linspace(0, 2 * math.pi, AROUND, endpoint=False)
         ring = np.stack([np.cos(phi), np.sin(phi)], -1) / math.cos(math.pi / AROUND)  # encloses the circle
@@ -66,7 +72,7 @@ class Outlines:
         shown = np.flatnonzero(self.radius > 0)
         far = 2.0 * math.hypot(*self.size)
         radius = np.minimum(self.radius[shown], far)
-        labels = clusters(len(shown), *touching(self.x[shown], self.y[shown], radius)) if len(shown) else shown
+        labels = _chains(self.x[shown], self.y[shown], radius) if len(shown) else shown
         order = np.argsort(labels, kind="stable")
         cuts = np.flatnonzero(np.diff(labels[order])) + 1
         return np.split(shown[order], cuts) if len(shown) else []
@@ -86,6 +92,40 @@ class Outlines:
 
         In the order of the drops; where circles overlap, a pixel comes up for each.
         """
+        drop, row, start, stop = self._lines()
+        line, column = _ranges(start, stop)
+        return row[line] * self.size[0] + column, drop[line]
+
+    def united(self, labels: Indices) -> tuple[Indices, Indices]:
+        """Pixels of the image in any circle, in their order, each once, and the label of its circles, (P,) each.
+
+        labels: (N,) of circles, of which those that overlap carry the same. However much they overlap, this takes no
+        more memory than a few numbers for each pixel of the image.
+        """
+        width, height = self.size
+        cells = height * (width + 1)  # a row's last line may end after its last pixel
+        if np.minimum(math.pi * self.radius**2, cells).sum() < cells:
+            every, which = self.pixels()
+            pixels, least = np.unique(every, return_index=True)
+            return pixels, labels[which[least]]
+        over: Any = np.zeros(cells, dtype=np.int32)
+        total: Array = np.zeros(cells)
+        for first in range(0, len(self.x), BLOCK):
+            some = np.arange(len(self.x))[first : first + BLOCK]
+            drop, row, start, stop = self.take(some)._lines()
+            of_line = labels[some].astype(np.float64)[drop]
+            for sign, at in ((1, start), (-1, stop)):
+                cell = row * (width + 1) + at
+                over += sign * np.bincount(cell, minlength=cells).astype(np.int32)
+                total += np.bincount(cell, sign * of_line, cells)  # whole numbers: sums are exact
+        for sums in (over, total):
+            np.cumsum(sums, out=sums)
+        over, total = (np.ravel(sums.reshape(height, -1)[:, :width]) for sums in (over, total))
+        pixels = np.flatnonzero(over)
+        return pixels, (total[pixels] / over[pixels]).astype(np.intp)
+
+    def _lines(self) -> tuple[Indices, Indices, Indices, Indices]:
+        """Of each row of pixels of each circle the drop, the row, its first column and the one after its last."""
         width, height = self.size
         x, y = self.x, self.y
         radius = np.minimum(self.radius, 2.0 * (width + height))
@@ -95,8 +135,23 @@ class Outlines:
         half = np.sqrt(np.maximum(radius[drop] ** 2 - (row - y[drop]) ** 2, 0))
         start = np.clip(np.ceil(x[drop] - half), 0, width).astype(np.intp)
         stop = np.clip(np.floor(x[drop] + half) + 1, start, width).astype(np.intp)
-        line, column = _ranges(start, stop)
-        return row[line] * width + column, drop[line]
+        return drop, row, start, stop
+
+
+def _chains(x: Array, y: Array, radius: Array) -> Indices:
+    """Label, (N,), of circles: those of a chain of which each meets the next carry the same.
+
+    Block by block, each joined to the chains so far: where thousands overlap, all their pairs would fill the memory.
+    """
+    count = len(x)
+    every = np.arange(count)
+    head, labels = every, every
+    for first in range(0, count, BLOCK):
+        some = None if count <= BLOCK else (every >= first) & (every < first + BLOCK)
+        one, other = touching(x, y, radius, some)
+        labels = clusters(count, np.concatenate([one, every]), np.concatenate([other, head]))
+        head = np.unique(labels, return_index=True)[1][labels]
+    return labels
 
 
 def _ranges(first: Indices, last: Indices) -> tuple[Indices, Indices]:

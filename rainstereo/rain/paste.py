@@ -1,7 +1,7 @@
 """Drawing tables of taps (`lookups`) over a frame.
 
-Bytes are summed three channels at a time (`words`), so that a tap costs one multiplication: in a compiled loop that
-writes each pixel at once (`rainstereo.compiled.sums`), or, without numba and bit for bit the same, as a sparse product.
+Bytes are summed in a compiled loop, eight pixels at a time, all channels of them (`rainstereo.compiled.eights`), or,
+without numba and bit for bit the same, as sparse products of three channels in one number (`words`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rainstereo import compiled
-from rainstereo.compiled.layout import BELOW, EVERY, PACKED
+from rainstereo.compiled.layout import BELOW, EVERY, LANES, LONG_BITS, PACKED, SHORT_BITS
 from rainstereo.types import Image
 
 from .lookups import Lookups
@@ -28,7 +28,7 @@ from .words import clip, packed, unpack
 
 SHIFT = UNIT.bit_length() - 1
 KEPT = 5 << 22  # taps up to which all taps are kept ready for the loop: 4 bytes each
-SHORT, LONG = 20, 32  # bits of a place where a tap has 32 bits, and where it has 64
+SHORT = 1 << SHORT_BITS  # places, up to which a tap has 32 bits; else it has 64
 MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
 ROWS = 1 << 14  # that are summed at a time: few enough for the caches
 DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black
@@ -58,16 +58,30 @@ class Piece:
         return csr_array((weights, places.astype(np.int32), ends), shape=(len(ends) - 1, columns))
 
 
+@dataclass(frozen=True, eq=False)
+class Eights:
+    """What the loop over a piece takes (`compiled.sums.sum_quads`): rows are filled up to a multiple of eight."""
+
+    pixels: Any
+    most: Any
+    taps: Any
+    counts: Any
+    places: Any
+    roundings: Any
+
+
 class Paste:
     """Tables of one frame, and what is done to all pixels of them at once.
 
-    size: (width, height) of the images.
+    size: (width, height) of the images. soft: (S,) uint32, pixels that show something of what is below.
     """
 
     def __init__(self, tables: Sequence[Lookups], size: tuple[int, int]) -> None:
         self.tables = [table for table in tables if len(table.pixels)]
         self.size = size
-        self.soft = np.concatenate([np.zeros(0, np.intp), *(np.flatnonzero(table.clear) for table in self.tables)])
+        self._clear = [np.rint(table.clear * UNIT).astype(np.uint16) for table in self.tables]
+        soft = [table.pixels[clear > 0] for table, clear in zip(self.tables, self._clear, strict=True)]
+        self.soft: Any = np.concatenate([np.zeros(0, dtype=np.uint32), *soft]).astype(np.uint32)
         self.taps = sum(len(table.texels) for table in self.tables)
         self._matrices: dict[type, list[Any]] = {}
         self._spare: deque[Any] = deque()  # memory for words, of which threads take one each
@@ -78,39 +92,39 @@ class Paste:
             return
         target, beneath = _flat(out), _flat(below)
         levels = self._needed.levels(scene)
-        if out.dtype == np.uint8:
-            for first in range(0, target.shape[1], PACKED):
-                self._bytes(levels, beneath, target, slice(first, min(first + PACKED, target.shape[1])))
-        else:
+        if out.dtype != np.uint8:
             self._numbers(levels, beneath, target)
+        elif compiled.available():
+            self._quads(levels, beneath, target)
+        else:
+            for first in range(0, target.shape[1], PACKED):
+                self._words(levels, beneath, target, slice(first, min(first + PACKED, target.shape[1])))
 
-    def _bytes(self, levels: list[Image], below: Image, out: Image, part: slice) -> None:
-        """Sums of up to three channels of bytes."""
+    def _quads(self, levels: list[Image], below: Image, out: Image) -> None:
+        """Sums of bytes in compiled loops, all channels together."""
+        from rainstereo.compiled.quads import pack_some
+        from rainstereo.compiled.sums import sum_quads
+
+        end = self._needed.ends[-1]
         try:
             row = self._spare.pop()
         except IndexError:
-            row = np.empty(self._needed.ends[-1], dtype=np.uint64)
-        self._needed.put_words(levels, part, row)
-        if compiled.available():
-            self._compiled(row, below, out, part)
-        else:
-            self._products(row, below, out, part)
+            row = np.empty(end + len(self.soft), dtype=np.uint32)
+        self._needed.put_quads(levels, row[:end])
+        pack_some(below, self.soft, row[end:])
+        for some in self._eights:
+            sum_quads(
+                out.reshape(-1), out.shape[1], row, SHIFT, some.pixels, some.most, some.taps, some.counts, some.places,
+                some.roundings,
+            )  # fmt: skip
         self._spare.append(row)
 
-    def _compiled(self, words: Any, below: Image, out: Image, part: slice) -> None:
-        from rainstereo.compiled.sums import sum_words
-
-        channels = part.stop - part.start
-        for piece, most, taps in self._fours:
-            rows = piece.rows
-            sum_words(
-                out, below, part.start, channels, words, SHIFT, self._bits, piece.table.pixels[rows].view(np.uint32),
-                most, taps, self._roundings[piece.number][rows], self._clear[piece.number][rows],
-            )  # fmt: skip
-
-    def _products(self, words: Any, below: Image, out: Image, part: slice) -> None:
+    def _words(self, levels: list[Image], below: Image, out: Image, part: slice) -> None:
+        """Sums of up to three channels of bytes, as sparse products."""
+        row: Any = np.empty(self._needed.ends[-1], dtype=np.uint64)
+        self._needed.put_words(levels, part, row)
         for piece, matrix in self._each(np.uint64):
-            total = matrix @ words
+            total = matrix @ row
             total += self._roundings[piece.number][piece.rows] * np.uint64(EVERY)
             pixels, clear = piece.table.pixels[piece.rows], self._clear[piece.number][piece.rows]
             soft = np.flatnonzero(clear)
@@ -170,30 +184,41 @@ class Paste:
                 yield some, self._places[some.table.texels[some.taps]]
 
     @property
-    def _fours(self) -> Iterable[tuple[Piece, Any, Any]]:
-        """Pieces, and their taps, four rows' together: whole tables, or, to spare memory, parts of them."""
+    def _eights(self) -> Iterable[Eights]:
+        """What the loop takes of whole tables, or, to spare memory, of parts of them."""
         if self.taps <= KEPT:
             return self._kept
-        return (self._in_fours(some) for piece in self._wholes for some in piece.cut(ROWS))
+        return (self._in_eights(some) for piece in self._wholes for some in piece.cut(ROWS))
 
     @cached_property
-    def _kept(self) -> list[tuple[Piece, Any, Any]]:
-        return [self._in_fours(piece) for piece in self._wholes]
+    def _kept(self) -> list[Eights]:
+        return [self._in_eights(piece) for piece in self._wholes]
 
-    def _in_fours(self, piece: Piece) -> tuple[Piece, Any, Any]:
-        from rainstereo.compiled.sums import AHEAD, FOUR, interleave
+    def _in_eights(self, piece: Piece) -> Eights:
+        from rainstereo.compiled.sums import interleave, lines
 
-        table, counts = piece.table, piece.table.counts[piece.rows]
-        most = np.maximum.reduceat(counts, np.arange(0, len(counts), FOUR))
-        long = FOUR * int(most.sum(dtype=np.int64)) + AHEAD
-        taps = np.empty(long, dtype=np.int32 if self._bits <= SHORT else np.int64)
-        interleave(counts, self._places, table.texels[piece.taps], table.weights[piece.taps], self._bits, most, taps)
-        return piece, most, taps
+        table, counts, clear = piece.table, piece.table.counts[piece.rows], self._clear[piece.number][piece.rows]
+        most = np.maximum.reduceat(np.maximum(counts + (clear > 0), 1), np.arange(0, len(counts), LANES))
+        kind, bits = self._of_tap
+        taps: Any = np.empty(LANES * int(most.sum(dtype=np.int64)), dtype=kind)
+        before = [*self._clear[: piece.number], self._clear[piece.number][: piece.rows.start]]
+        below = self._needed.ends[-1] + sum(np.count_nonzero(some) for some in before)
+        interleave(
+            counts, self._places, table.texels[piece.taps], table.weights[piece.taps], clear, below, bits, most, taps
+        )
+        of_lines: Any = np.empty(len(most), dtype=np.uint32)
+        places: Any = np.empty(lines(taps, most, bits, of_lines, np.empty(0, dtype=np.uint32)), dtype=np.uint32)
+        lines(taps, most, bits, of_lines, places)
+        rest = (0, -len(counts) % LANES)
+        pixels = np.pad(table.pixels[piece.rows].view(np.uint32), rest, mode="edge")
+        roundings = self._roundings[piece.number][piece.rows].astype(np.int32) - (BELOW << SHIFT)
+        return Eights(pixels, most.astype(np.uint32), taps, of_lines, places, np.pad(roundings, rest, mode="edge"))
 
     @cached_property
-    def _bits(self) -> int:
-        """Of a place among the texels."""
-        return SHORT if self._needed.ends[-1] <= 1 << SHORT else LONG
+    def _of_tap(self) -> tuple[type, int]:
+        """Type of taps that have room for all places, of the texels and of the soft pixels after them; bits of one."""
+        short = self._needed.ends[-1] + len(self.soft) <= SHORT
+        return (np.int32, SHORT_BITS) if short else (np.int64, LONG_BITS)
 
     @cached_property
     def _places(self) -> Any:
@@ -212,10 +237,6 @@ class Paste:
         for table in self.tables:
             used[table.texels] = True
         return Texels.of(self.size, used)
-
-    @cached_property
-    def _clear(self) -> list[Any]:
-        return [np.rint(table.clear * UNIT).astype(np.uint16) for table in self.tables]
 
     @cached_property
     def _roundings(self) -> list[Any]:

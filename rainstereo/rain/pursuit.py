@@ -14,19 +14,22 @@ What they have in common with one another depends on the level alone, and is tab
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from rainstereo import compiled
+from rainstereo.patch import folded_along
 from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.types import Array, Image, Indices, Mask
 
 from .pyramid import LONG, Copy, copies, copy_starts, sizes
-from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, steps_between, whole
+from .quadtree import Quadtree, Steps, Taps, brought_in, ends_of, mixed, of_some, span_of, whole
 
 HALVINGS = 3
 SHAPES = tuple((a, b) for a in range(HALVINGS + 1) for b in range(HALVINGS + 1) if abs(a - b) <= LONG)
@@ -49,10 +52,16 @@ SCREENED, OFFERED = 12, 256
 """After so many texels of a pixel only so many others, those worth most then, are offered to it."""
 ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
 TOGETHER = 128  # pixels: few enough for the caches
+FINER, MOST_RAYS = 2, 0.5
+"""Levels by which a window must be finer that holds the most of a pixel's rays, so that it and the rest are apart."""
 FEW, DEAR = 2, 1.5
 """Levels below this have so many texels that making and finding them costs, too; what one of these counts for."""
+LARGE, UNEVEN = 4, 2.0
+"""Level of windows from which, and at which, the finest, photographs are more uneven than their statistics say: edges
+and whole objects; what errors there count for."""
 AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
-QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+POINTS_ALONG, MOST_ALONG = 32, 4
+"""Points along a pixel's side that rays stand for, each for its part, and along such a part at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,27 +88,60 @@ class Pursuit:
         return np.where((span < SMALL) | (level >= len(sizes(self.size))), -1, level)
 
     def taps(self, x: Array, y: Array, weights: Array) -> Taps:
-        """Texels of M pixels for rays at x, y, (K, M) float32 each, in the image, K a square, of weights (K, M).
+        """Texels of M pixels for rays that meet the image's plane at x, y, of weights, (K, M) float32, K a square.
 
         Pixels that see several places far apart get those of the tree.
         """
-        steps, span = steps_between(x, y, weights), span_of(x, y, weights)
+        given = x, y
+        x, y, steps = brought_in(x, y, weights, self.size, self.tree.border)
+        span = span_of(x, y, weights)
         able = np.flatnonzero((self.level(span) >= 0) & ~self.tree.is_loose(span, steps, weights))
-        low = np.stack([ends_of(at, weights)[0] for at in (x, y)])[:, able]
-        rays = [columns[:, able] for columns in (x, y, weights)]
-        chosen = self._choose(rays[0], rays[1], rays[2], of_some(steps, able), low, span[able])
         rest = np.ones(len(span), dtype=np.bool_)
         rest[able] = False
-        tree = self.tree.taps(x[:, rest], y[:, rest], weights[:, rest])
+        tree = self.tree.taps(given[0][:, rest], given[1][:, rest], weights[:, rest])
+        owner, share = self._parts(x[:, able], y[:, able], weights[:, able], span[able])
+        columns = able[owner]
+        chosen = self._choose(x[:, columns], y[:, columns], share, of_some(steps, columns))
         there = np.arange(MOST) < chosen.counts[:, None]
-        pixel = np.repeat(np.arange(len(able)), chosen.counts)
+        pixel = np.repeat(owner, chosen.counts)
         taps = whole(pixel, chosen.texel[there], chosen.weight[there], len(able), np.zeros(len(able)))
         return mixed(~rest, tree, taps)
 
-    def _choose(self, x: Array, y: Array, weights: Array, steps: Steps, low: Array, span: Array) -> _Chosen:
-        """Texels for rays at x, y (K, M). low: (2, M) least x and y, span: (M,)."""
-        count = weights.shape[1]
+    def _parts(self, x: Array, y: Array, weights: Array, span: Array) -> tuple[Indices, Array]:
+        """Parts of pixels that are told by windows of their own: whose each is, (P,) in order, and its weights, (K, P).
+
+        Pixels of whose rays most meet in a small place, and the rest do not, as beside a dark rim, are two parts.
+        """
         level = self.level(span)
+        wide = np.flatnonzero(level >= FINER)
+        inside = self._dense(*(columns[:, wide] for columns in (x, y, weights)), level[wide] - FINER)
+        two = inside.any(0) & (~inside & (weights[:, wide] > 0)).any(0)
+        wide, inside = wide[two], inside[:, two]
+        first, second = weights.copy(), weights[:, wide].copy()
+        first[:, wide] *= inside
+        second *= ~inside
+        owner = np.concatenate([np.arange(len(span)), wide])
+        order = np.argsort(owner, kind="stable")
+        return owner[order], np.concatenate([first, second], 1)[:, order]
+
+    def _dense(self, x: Array, y: Array, weights: Array, level: Indices) -> Mask:
+        """Which rays are in a window of a level, (M,), around the pixel's middle ray, (K, M), if `MOST_RAYS` are."""
+        away = np.zeros(weights.shape, dtype=np.float32)
+        for at in (x, y):
+            order = np.argsort(at, axis=0)
+            so_far = np.cumsum(np.take_along_axis(weights, order, 0), axis=0)
+            middle = (so_far < 0.5 * so_far[-1:]).sum(0)
+            centre = np.take_along_axis(at, np.take_along_axis(order, middle[None], 0), 0)
+            np.maximum(away, np.abs(at - centre), out=away)
+        inside = away <= 0.5 * ROOM * np.exp2(level.astype(np.float32))
+        dense = (weights * inside).sum(0) >= MOST_RAYS * weights.sum(0)
+        return np.asarray(inside & dense)
+
+    def _choose(self, x: Array, y: Array, weights: Array, steps: Steps) -> _Chosen:
+        """Texels for rays at x, y (K, M)."""
+        count = weights.shape[1]
+        level = np.maximum(self.level(span_of(x, y, weights)), 0)
+        low = np.stack([ends_of(at, weights)[0] for at in (x, y)])
         texel: Indices = np.zeros((count, MOST), dtype=np.intp)
         weight: Array = np.zeros((count, MOST))
         counts: Indices = np.zeros(count, dtype=np.intp)
@@ -114,21 +156,24 @@ class Pursuit:
 
     def _of_level(self, level: int, x: Array, y: Array, weights: Array, steps: Steps, low: Array) -> _Chosen:
         words, scale, count = _dictionary(level), 0.5**level, weights.shape[1]
-        places = SIDE * BINS
         first = np.floor((low + 0.5) * scale).astype(np.intp) & -ALIGNED  # column and row of the window
-        bins: Indices = np.empty((len(QUARTERS), *weights.shape), dtype=np.intp)
-        fine = np.float32(scale * BINS)
-        for part, (a, b) in enumerate(QUARTERS):
+        along = min(max(POINTS_ALONG // math.isqrt(len(weights)), 1), MOST_ALONG)
+        parts = ((np.arange(along) + 0.5) / along - 0.5).astype(np.float32)
+        if compiled.available():
+            return self._compiled(level, first, x, y, weights, steps, parts)
+        places, fine = SIDE * BINS, np.float32(scale * BINS)
+        bins: Indices = np.empty((along**2, *weights.shape), dtype=np.intp)
+        for part, (a, b) in enumerate(product(parts, parts)):
             j, i = (
-                (at + np.float32(a) * across + np.float32(b) * along + np.float32(0.5)) * fine - start
-                for at, across, along, start in zip((x, y), steps[:2], steps[2:], first * BINS, strict=True)
+                (folded_along(at + a * right + b * below, n - 1, self.tree.border) + np.float32(0.5)) * fine - start
+                for at, right, below, n, start in zip(
+                    (x, y), steps[:2], steps[2:], self.size, first * BINS, strict=True
+                )
             )
             j, i = (np.clip(at, 0, places - 1).astype(np.intp) for at in (j, i))
             bins[part] = i * places + j
         where = np.moveaxis(bins, -1, 0).reshape(count, -1)
-        share = np.tile(np.float32(0.25) * weights.T, len(QUARTERS))
-        if compiled.available():
-            return self._compiled(level, first, where, share)
+        share = np.tile(np.float32(1 / len(bins)) * weights.T, len(bins))
         common = _common(words, where, share)
         offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
@@ -137,24 +182,30 @@ class Pursuit:
         texel = np.take_along_axis(numbers, taken, 1)
         return _Chosen(texel, weight, counts)
 
-    def _compiled(self, level: int, first: Indices, where: Indices, share: Image) -> _Chosen:
+    def _compiled(
+        self, level: int, first: Indices, x: Array, y: Array, weights: Array, steps: Steps, parts: Array
+    ) -> _Chosen:
         from rainstereo.compiled.pursuit import choose
 
-        words, count = _dictionary(level), len(where)
+        words, count = _dictionary(level), weights.shape[1]
         texel: Indices = np.zeros((count, MOST), dtype=np.intp)
         weight: Array = np.zeros((count, MOST))
         counts: Indices = np.zeros(count, dtype=np.intp)
         shapes = np.array([(*shape, *self._limits(level, shape)) for shape in SHAPES], dtype=np.int64)
         least = np.float32(FRESH) * np.diag(words.gram)
+        last = tuple(np.float32(n - 1) for n in self.size)
+        rays = np.stack([x.T, y.T, *(step.T for step in steps), weights.T], axis=1)
         choose(
-            words.lags, words.gram, _atoms(), shapes, self._prices(level), least, SCREENED, OFFERED, NEGATIVE,
-            RIDGE, RIDGE_GROWS, first, where, share, _boxes(where, share), texel, weight, counts,
+            words.lags, words.gram, _atoms(), shapes, self._prices(level), least, SCREENED, OFFERED, NEGATIVE, RIDGE,
+            RIDGE_GROWS, AROUND, first, rays, parts, np.float32(BINS * 0.5**level), last, self.tree.border == "mirror",
+            texel, weight, counts,
         )  # fmt: skip
         return _Chosen(texel, weight, counts)
 
     def _prices(self, level: int) -> Any:
         """What each texel of a window must be worth, (A,) float32."""
-        dear = np.array([DEAR if level + min(shape) < FEW else 1.0 for shape in SHAPES])
+        uneven = UNEVEN if level == 0 or level >= LARGE else 1.0
+        dear = np.array([DEAR if level + min(shape) < FEW else 1.0 for shape in SHAPES]) / uneven
         return (self.worth * dear[_atoms()[:, 0]]).astype(np.float32)
 
     def _limits(self, level: int, shape: tuple[int, int]) -> tuple[int, int, int]:
@@ -233,6 +284,11 @@ def _dictionary(level: int) -> _Dictionary:
     whole = _sums(base.reshape(-1, SIDE, SIDE))
     gram = _sums(np.ascontiguousarray(whole.T).reshape(-1, SIDE, SIDE))
     return _Dictionary(lags, gram.astype(np.float32))
+
+
+def forget() -> None:
+    """Give up what is tabulated of windows, 14 MB for each level; it is found anew when it is needed."""
+    _dictionary.cache_clear()
 
 
 def _common(words: _Dictionary, where: Indices, share: Image) -> Image:

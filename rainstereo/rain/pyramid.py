@@ -16,8 +16,8 @@ from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.types import Array, Image
 
 SMALLEST = 4  # pixels along the shorter side
-BIAS = 0.125  # gray levels by which OpenCV's mean of four bytes is too large: it rounds halves up
-BIAS_OF_PAIRS = 0.25  # the same of means of two bytes, halves rounded up
+BIAS = 0.125  # gray levels by which OpenCV's mean of four whole numbers is too large: it rounds halves up
+BIAS_OF_PAIRS = 0.25  # by which means of two bytes are too small, halves rounded down
 PAIRED = 2  # level from which there are copies that are wider than high: finer ones are dear to make
 LONG = 2  # times that they are twice as wide
 SHARP = 2  # level up to which a sharp image is as uneven as there
@@ -50,9 +50,18 @@ class Copy:
     height: int
 
     @property
+    def up(self) -> bool:
+        """Whether halves are rounded up where it is made of the copy before it.
+
+        In turn: rounded up each time, an image would become lighter by a gray level in some six copies.
+        """
+        by = abs(self.across - self.down)
+        return by % 2 == 0 if by else self.across % 2 == 1
+
+    @property
     def bias(self) -> float:
         """Gray levels by which its bytes are too large, in the mean."""
-        return BIAS * min(self.across, self.down) + BIAS_OF_PAIRS * abs(self.across - self.down)
+        return BIAS * (min(self.across, self.down) % 2) - BIAS_OF_PAIRS * (abs(self.across - self.down) % 2)
 
 
 def copies(size: tuple[int, int]) -> list[Copy]:
@@ -77,8 +86,10 @@ def copy_starts(size: tuple[int, int]) -> list[int]:
     return found
 
 
-def half(image: Image) -> Image:
-    """Means over 2 x 2 pixels of an image, (H, W[, C]) uint8, uint16 or float32."""
+def half(image: Image, up: bool = True) -> Image:
+    """Means over 2 x 2 pixels of an image, (H, W[, C]) uint8, uint16 or float32; whether halves are rounded up."""
+    if not up and image.dtype.kind == "u":
+        return ~half(~image)
     height, width = image.shape[:2]
     if height % 2 or width % 2:
         image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE).reshape(

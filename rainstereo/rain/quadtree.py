@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from rainstereo.patch import folded_along, turned_along
 from rainstereo.types import Array, Image, Indices, Mask
 
 from .pyramid import sizes, starts, unevenness
@@ -27,6 +28,8 @@ Steps = tuple[Array, Array, Array, Array]
 
 LOOSE = 2.5
 """Times the usual step between its rays, all along it, that a pixel's rays may span as one."""
+JUMP = 4.0
+"""Times its neighbour's that the step of a ray may be whose other neighbour is dark."""
 MERGES = 3
 ALIGNED = 1 << MERGES
 UNIT = 1024
@@ -53,14 +56,18 @@ class Taps:
 
 @dataclass(frozen=True)
 class Quadtree:
-    """size: (width, height) of the image. extent: texels that a pixel's rays may span. worth: gray levels squared."""
+    """size: (width, height) of the image. extent: texels that a pixel's rays may span. worth: gray levels squared.
+
+    border: how the image goes on, see `patch.folded`.
+    """
 
     size: tuple[int, int]
     extent: int
     worth: float
+    border: str = "mirror"
 
     def taps(self, x: Array, y: Array, weights: Array) -> Taps:
-        """Texels of M pixels for rays at x, y, (K, M) float32 each, in the image, K a square, of weights (K, M)."""
+        """Texels of M pixels for rays that meet the image's plane at x, y, of weights, (K, M) float32, K a square."""
         side = -(-(self.extent + ALIGNED) // ALIGNED) * ALIGNED
         step = max(1, CELLS // side**2)
         parts = [
@@ -70,7 +77,7 @@ class Quadtree:
         return Taps(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("texels", "weights", "counts", "error")))
 
     def _some(self, x: Array, y: Array, weights: Array, side: int) -> Taps:
-        steps = steps_between(x, y, weights)
+        x, y, steps = brought_in(x, y, weights, self.size, self.border)
         span = span_of(x, y, weights)
         loose = self.is_loose(span, steps, weights)
         if loose.any():
@@ -266,6 +273,16 @@ def span_of(x: Array, y: Array, weights: Array) -> Array:
     return np.maximum(right - left, bottom - top)
 
 
+def brought_in(
+    x: Array, y: Array, weights: Array, size: tuple[int, int], border: str
+) -> tuple[Array, Array, Steps]:  # fmt: skip
+    """Where rays, (K, M), fall in the image, and steps there, as `steps_between`: of rays that are not folded yet."""
+    steps = steps_between(x, y, weights)
+    turns = [turned_along(at, n - 1, border) for at, n in zip((x, y), size, strict=True)]
+    x, y = (folded_along(at, n - 1, border) for at, n in zip((x, y), size, strict=True))
+    return x, y, (steps[0] * turns[0], steps[1] * turns[1], steps[2] * turns[0], steps[3] * turns[1])
+
+
 def of_some(steps: Steps, some: Indices) -> Steps:
     """Steps of some pixels."""
     a, b, c, d = (step[:, some] for step in steps)
@@ -289,7 +306,11 @@ def mixed(second: Mask, one: Taps, other: Taps) -> Taps:
 
 
 def steps_between(x: Array, y: Array, weights: Array) -> Steps:
-    """From each ray, (K, M), to its right neighbour, x and y, and its lower one: the shorter of both sides' steps."""
+    """From each ray, (K, M), to its right neighbour, x and y, and its lower one: the shorter of both sides' steps.
+
+    With a lit ray on one side only it may be the way to what another drop shows; then it is as its neighbour's, if that
+    is much shorter.
+    """
     side, far = math.isqrt(len(x)), np.float32(np.inf)
     shape = (side, side, weights.shape[1])
     dark = np.where(weights > 0, np.float32(0), far).reshape(shape)
@@ -298,18 +319,26 @@ def steps_between(x: Array, y: Array, weights: Array) -> Steps:
         low = tuple(slice(None, -1) if n == axis else slice(None) for n in range(3))
         high = tuple(slice(1, None) if n == axis else slice(None) for n in range(3))
         steps = [at.reshape(shape)[high] - at.reshape(shape)[low] for at in (x, y)]
-        length = np.abs(steps[0]) + np.abs(steps[1]) + dark[high] + dark[low]
-        before = np.full(shape, far, dtype=np.float32)
-        before[high] = length
-        closer = before[low] < length  # is the one before, for all rays but the last
-        lone = np.isinf(before)
-        lone[low] &= np.isinf(length)
+        between = np.abs(steps[0]) + np.abs(steps[1]) + dark[high] + dark[low]
+        before, after = np.full(shape, far, dtype=np.float32), np.full(shape, far, dtype=np.float32)
+        before[high], after[low] = between, between
+        length = np.minimum(before, after)
+        lone, first, last = np.isinf(length), np.isinf(before), np.isinf(after)
+        closer = before[low] < after[low]  # is the one before, for all rays but the last
+        columns: list[Image] = []
         for step in steps:
             column: Image = np.empty(shape, dtype=np.float32)
             column[high] = step
             column[tuple(slice(0, 1) if n == axis else slice(None) for n in range(3))] = 0
             column[low] = np.where(closer, column[low], step)
             column[lone] = 0
+            columns.append(column)
+        jumps = length * np.float32(1 / JUMP)
+        to_next = (first & ~lone)[low] & (jumps[low] > length[high])
+        to_one_before = (last & ~lone)[high] & (jumps[high] > length[low])
+        for column in columns:
+            column[low] = np.where(to_next, column[high], column[low])
+            column[high] = np.where(to_one_before, column[low], column[high])
             found.append(column.reshape(x.shape))
     return found[0], found[1], found[2], found[3]
 

@@ -411,11 +411,11 @@ def _batch(groups: Sequence[Group], numbers: Indices) -> Batch:
     """Groups as one batch: one group, or caps of one face."""
     drops = [drop for group in groups for drop in group.drops]
     outlines = Outlines.joined([group.outlines for group in groups])
-    pixels, which = outlines.pixels()
     if len(drops) == len(groups) and isinstance(drops[0], SphericalCap):
+        pixels, which = outlines.pixels()
         return Batch(drops, pixels, numbers[which], which)
-    pixels, first = np.unique(pixels, return_index=True)  # circles of different groups share none
-    group = np.repeat(numbers, [len(group.drops) for group in groups])[which[first]]
+    of_drop = np.repeat(numbers, [len(group.drops) for group in groups])
+    pixels, group = outlines.united(of_drop)  # circles of different groups share none
     low, high = outlines.y - outlines.radius, outlines.y + outlines.radius
     return Batch(drops, pixels, group, None, low, high)
 

@@ -62,7 +62,7 @@ class SingleRay:
             for part in (_x, _y, lambda s: s.gain[0], lambda s: s.opacity[0])
         )
         kind = (gain > 0).view(np.uint8) + (opacity > 0).view(np.uint8)
-        edge = self.minifier.edges(pixels, kind)
+        edge, _ = self.minifier.edges(pixels, kind)
         whole, dark = np.flatnonzero((kind == 2) & ~edge), np.flatnonzero((kind == 1) & ~edge)
         clear: Image = np.zeros(len(pixels), dtype=np.float32)
         found = [

@@ -25,7 +25,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
 from scipy.special import roots_legendre
 
 from rainstereo.droplet import WATER, Drop, SphericalCap, cap_volume, check_radius
@@ -144,6 +143,8 @@ class Streak(Drop):
         (before the first knot: ends); that place; and 1 beyond the path's ends, else 0.
         """
         v, widths = self._knots, np.asarray(self.half_width)
+        from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator  # dear to import
+
         path = CubicSpline(v, self._turned(*self.path.T)[0], bc_type="natural")
         growth = PchipInterpolator(v, widths).derivative()(v)
         growth[[0, -1]] = 0  # so that the ends are smooth

@@ -12,9 +12,9 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 
-from rainstereo import compiled
 from rainstereo.compiled.layout import COLUMNS, QUARTERS, ROWS
 from rainstereo.types import Image, Mask
 
@@ -30,8 +30,8 @@ class Texels:
 
     size: (width, height). picked: of each level before the first that is made as a whole, (n,) uint32 numbers of its
     texels that are used. whole: texels of that level and all copies after it, which stand first in the row, 0 if there
-    is no such level. made: (m, 5) int64, how these copies are made: how, the place of what each is made of, its width
-    and height, and the copy's own place.
+    is no such level. made: (m, 6) int64, how these copies are made: how, the place of what each is made of, its width
+    and height, the copy's own place, and whether halves are rounded up.
     """
 
     size: tuple[int, int]
@@ -61,10 +61,10 @@ class Texels:
             given = number[_parent(every[i])]
             how = QUARTERS if i < levels else COLUMNS if every[i].across > every[i].down else ROWS
             first = starts[given] - starts[base]
-            made.append((how, first, every[given].width, every[given].height, starts[i] - starts[base]))
+            made.append((how, first, every[given].width, every[given].height, starts[i] - starts[base], every[i].up))
         picked = [np.flatnonzero(used[a:b]).astype(np.uint32) for a, b in pairwise(starts[: base + 1])]
         whole = starts[-1] - starts[base] if base <= last else 0
-        return cls(size, tuple(picked), whole, np.array(made, dtype=np.int64).reshape(-1, 5))
+        return cls(size, tuple(picked), whole, np.array(made, dtype=np.int64).reshape(-1, 6))
 
     @cached_property
     def starts(self) -> list[int]:
@@ -86,26 +86,28 @@ class Texels:
 
     def levels(self, scene: Image) -> list[Image]:
         """The levels of an image, (h w, C), up to the first that is needed as a whole."""
-        level = scene.reshape(*scene.shape[:2], -1)
-        found = [level]
+        found = [scene.reshape(*scene.shape[:2], -1)]
         while len(found) < len(self.picked) + (self.whole > 0):
-            level = half(level)
-            found.append(level)
+            found.append(half(found[-1], copies(self.size)[len(found)].up))
         return [each.reshape(-1, each.shape[-1]) for each in found]
 
     def put_words(self, levels: list[Image], part: slice, row: Any) -> None:
-        """Write words of up to three channels of bytes, (n,)."""
-        if not compiled.available():
-            self._put(levels, part, row, words.packed, words.mean)
-            return
-        from rainstereo.compiled.words import average, pack, pack_some
+        """Write words of up to three channels of bytes, (n,) uint64."""
+        self._put(levels, part, row, words.packed, words.mean)
 
-        channels = part.stop - part.start
+    def put_quads(self, levels: list[Image], row: Any) -> None:
+        """Write quads of up to four channels of bytes, (n,) uint32, in compiled loops."""
+        from rainstereo.compiled.quads import average, pack, pack_some
+
         if self.whole:
-            pack(levels[-1], part.start, channels, row[: len(levels[-1])])
+            base, quads = levels[-1], row[: len(levels[-1])]
+            if base.shape[1] == 3:
+                cv2.cvtColor(base[None], cv2.COLOR_BGR2BGRA, dst=quads.view(np.uint8).reshape(1, -1, 4))
+            else:
+                pack(base, quads)
             average(row, self.made)
         for level, rows, (a, b) in zip(levels, self.picked, pairwise(self.ends), strict=False):
-            pack_some(level, part.start, channels, rows, row[a:b])
+            pack_some(level, rows, row[a:b])
 
     def put_numbers(self, levels: list[Image], row: Image) -> None:
         """Write values, (n, C) float32."""
@@ -113,22 +115,23 @@ class Texels:
 
     def _put(
         self, levels: list[Image], part: slice, row: Any, of_values: Callable[[Image], Any],
-        of_parts: Callable[[list[Any]], Any],
+        of_parts: Callable[[list[Any], bool], Any],
     ) -> None:  # fmt: skip
-        """of_values: makes what is put there of texels, (n, C); of_parts: the mean of two or four."""
+        """of_values: makes what is put there of texels, (n, C); of_parts: the mean of two or four, and
+        whether halves are rounded up."""
         for level, rows, (a, b) in zip(levels, self.picked, pairwise(self.ends), strict=False):
             row[a:b] = of_values(level[rows][:, part])
         if not self.whole:
             return
         row[: len(levels[-1])] = of_values(levels[-1][:, part])
-        for how, given, width, height, made in self.made.tolist():
+        for how, given, width, height, made, up in self.made.tolist():
             grid = row[given : given + width * height].reshape(height, width, *row.shape[1:])
             parts = [grid]
             if how != COLUMNS:
                 parts = [each for some in parts for each in _halves(some, 0)]
             if how != ROWS:
                 parts = [each for some in parts for each in _halves(some, 1)]
-            found = of_parts(parts)
+            found = of_parts(parts, bool(up))
             size = found.shape[0] * found.shape[1]
             row[made : made + size] = found.reshape(size, *row.shape[1:])
 
@@ -149,7 +152,7 @@ def _halves(grid: Any, axis: int) -> tuple[Any, Any]:
     return first, second
 
 
-def _mean(parts: list[Any]) -> Any:
+def _mean(parts: list[Any], _up: bool) -> Any:
     total = parts[0] + parts[1]
     for part in parts[2:]:
         total += part

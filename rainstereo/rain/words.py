@@ -69,12 +69,12 @@ def clip(words: Any) -> None:
     words &= over
 
 
-def mean(parts: list[Any]) -> Any:
-    """Means of bytes in two or four words, halves rounded up."""
+def mean(parts: list[Any], up: bool) -> Any:
+    """Means of bytes in two or four words; whether halves are rounded up."""
     total = parts[0] + parts[1]
     for part in parts[2:]:
         total += part
-    total += np.uint64(len(parts) // 2 * EVERY)
+    total += np.uint64((len(parts) // 2 - (not up)) * EVERY)
     total >>= np.uint64(len(parts) // 2)
     total &= np.uint64(EVERY * 255)
     return total

@@ -12,7 +12,7 @@ from skimage import data
 
 from rainstereo import Camera, Chamber, Panel, footprint
 from rainstereo.aperture import aperture
-from rainstereo.defocus import add_blurred, apparent_distance, defocused, disc_parts, middle
+from rainstereo.defocus import add_blurred, apparent_distance, apparent_distances, defocused, disc_parts, middle
 from rainstereo.droplet import SphericalCap
 from rainstereo.patch import Patch, sample_pixels
 from rainstereo.thin_lens import ThinLens
@@ -188,7 +188,10 @@ def test_peak_opacity() -> None:
     image = np.zeros((960, 1280), np.uint8)
     for radius in (0.5e-3, 1e-3, 2e-3):
         drop = cap(30, radius=radius)
-        layer = defocused(drop, CAMERA, chamber_at(0.06), WIDE_OPEN).layer(image)
+        patch = defocused(drop, CAMERA, chamber_at(0.06), WIDE_OPEN)
+        layer, (rows, columns, opacity) = patch.layer(image), patch.opacity
+        assert (rows, columns) == (layer.rows, layer.columns)
+        np.testing.assert_array_equal(opacity, layer.opacity)
         share = min(1, (radius / WIDE_OPEN.aperture) ** 2)
         assert 0.99 * share <= layer.opacity.max() <= 1.09 * share  # a smaller disc, for its softer edge, is denser
 
@@ -303,6 +306,28 @@ def test_the_apparent_distance_is_where_rays_say() -> None:
     face = chamber.faces[1] + 0.005 + 1e-9
     t = trace(np.array([[639.5 + 12.0, 479.5]]), None, CAMERA, chamber, face)
     assert (t.source[0, 0] - 639.5) / 1200 * face == pytest.approx(0.01 * distance, rel=1e-4)
+
+
+def test_many_drops_are_found_where_each_is() -> None:
+    """Distances, and the pixels around, of all at once: as of one after the other, whatever faces they are on."""
+    chamber = Chamber((0.1, -0.05, 0.99), 0.05, (Panel(0.003, 1.49), Panel(0.004, 1.52)), (0.01,))
+    rng = np.random.default_rng(0)
+    drops = [
+        SphericalCap((x, y), radius, 0.9, panel=int(i % 2), face="far" if i % 3 else "near")
+        for i, (x, y, radius) in enumerate(rng.uniform((-0.02, -0.02, 2e-4), (0.02, 0.02, 2e-3), (150, 3)).tolist())
+    ]
+    low, high = footprint.extents(drops, CAMERA, chamber)
+    for drop, least, most, distance in zip(drops, low, high, apparent_distances(drops, chamber), strict=True):
+        around = footprint.outline(drop, CAMERA, chamber)
+        np.testing.assert_allclose(least, around.min((0, 1)), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(most, around.max((0, 1)), rtol=0, atol=1e-9)
+        assert distance == pytest.approx(apparent_distance(drop, chamber), abs=1e-12)
+    assert [len(each) for each in footprint.extents([], CAMERA, chamber)] == [0, 0]
+    turned = Chamber((0.8, 0.0, 0.6), 0.01, (Panel(0.003, 1.49),))
+    behind = SphericalCap((0.05, 0.0), 1e-3, 0.9)
+    assert apparent_distances([behind], turned, behind=True)[0] < 0
+    with pytest.raises(ValueError, match="behind the camera"):
+        apparent_distance(behind, turned)
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------

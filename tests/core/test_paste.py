@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rainstereo import Camera, Chamber, Panel, compiled
+from rainstereo.compiled.layout import SHORT_BITS
 from rainstereo.droplet import SphericalCap
 from rainstereo.rain import paste, words
 from rainstereo.rain.lookups import Lookups
@@ -45,7 +46,7 @@ def drawn(plan: Plan, image: np.ndarray) -> np.ndarray:
 
 
 @needs_numba
-@pytest.mark.parametrize("limits", [{}, {"KEPT": 100, "ROWS": 97}, {"SHORT": 8}], ids=["kept", "in parts", "64 bits"])
+@pytest.mark.parametrize("limits", [{}, {"KEPT": 100, "ROWS": 97}, {"SHORT": 256}], ids=["kept", "in parts", "64 bits"])
 @pytest.mark.parametrize("channels", [0, 1, 2, 3, 4])
 def test_compiled_as_not(plan, channels, limits, monkeypatch):
     """Bit for bit, whether places are kept or found anew, in 32 bits or 64."""
@@ -192,10 +193,11 @@ def test_words_of_bytes(channels):
     packed = [words.packed(each) for each in (one, other, third, last)]
     words.unpack(packed[0].copy(), shown)
     np.testing.assert_array_equal(shown, one)
-    words.unpack(words.mean(packed[:2]), shown)
-    np.testing.assert_array_equal(shown, (one.astype(int) + other + 1) // 2)
-    words.unpack(words.mean(packed), shown)
-    np.testing.assert_array_equal(shown, (one.astype(int) + other + third + last + 2) // 4)
+    for up in (False, True):
+        words.unpack(words.mean(packed[:2], up), shown)
+        np.testing.assert_array_equal(shown, (one.astype(int) + other + up) // 2)
+        words.unpack(words.mean(packed, up), shown)
+        np.testing.assert_array_equal(shown, (one.astype(int) + other + third + last + 1 + up) // 4)
 
 
 def test_words_are_clipped_field_by_field():
@@ -213,5 +215,5 @@ def test_words_are_clipped_field_by_field():
 
 def test_weights_and_places_fit_into_a_tap():
     """12 bits hold the weight of a texel, below 0, too; a word's field the sums that weights allow."""
-    assert 2 * UNIT <= 1 << (32 - paste.SHORT - 1)
+    assert 2 * UNIT <= 1 << (32 - SHORT_BITS - 1)
     assert (words.BELOW + 384) * UNIT <= 1 << words.FIELD

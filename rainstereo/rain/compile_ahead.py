@@ -1,0 +1,75 @@
+"""Loops compiled before a large plan needs memory, the first time by another process.
+
+The compiler takes 100 MB and more, and never gives them back; machine code that is read from disk takes next to none.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from rainstereo import compiled
+from rainstereo.compiled.layout import LONG_BITS, SHORT_BITS
+from rainstereo.types import Indices
+
+from .free_memory import give_back
+from .lookups import Lookups
+from .paste import Paste
+from .pursuit import Pursuit
+from .quadtree import Quadtree, Taps
+
+SIDE = 8  # pixels
+SPAN = 40  # of the rays of a pixel
+PATIENCE = 600.0  # seconds for another process; then this one compiles
+CHILD = """
+import sys
+sys.path[:] = {path!r}
+from rainstereo.rain import compile_ahead
+compile_ahead.compile_here({lasting})
+"""
+
+
+@cache
+def compile_ahead(lasting: bool) -> None:
+    """Have the loops ready that plans and frames of drops at rest need; nothing without numba."""
+    if not compiled.available():
+        return
+    from rainstereo.compiled.compile import folder
+
+    done = folder() / f"rain-ahead-{'lasting' if lasting else 'default'}"
+    if not done.exists() and Path(sys.executable or "").name.startswith("python"):  # not what else Python is built into
+        told = CHILD.format(path=sys.path, lasting=lasting)
+        try:
+            subprocess.run([sys.executable, "-c", told], capture_output=True, timeout=PATIENCE, check=True)
+            done.touch()
+        except (OSError, ValueError, TypeError, subprocess.SubprocessError):
+            pass  # nowhere to keep it, or no Python to start: this process compiles
+    compile_here(lasting)
+
+
+def compile_here(lasting: bool) -> None:
+    """Find the taps of one pixel, order, pack and draw them."""
+    along = np.linspace(0, SPAN, SIDE, dtype=np.float32)
+    x, y = (at.reshape(-1, 1) for at in np.meshgrid(along, along))
+    tree = Quadtree((SIDE * SPAN,) * 2, 17, 1.0)
+    sums = Pursuit((SIDE * SPAN,) * 2, 1.0, tree) if lasting else tree
+    sums.taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
+    _draw()
+    give_back()
+
+
+def _draw() -> None:
+    texels, weights = np.arange(4, dtype=np.int32), np.full(4, 256, dtype=np.int16)
+    one: Indices = np.zeros(1, dtype=np.intp)
+    taps = Taps(texels, weights, one + len(texels), np.zeros(1))
+    table = Lookups.of(one, one, taps, np.zeros(1), np.zeros((1, 2)), np.zeros(1, dtype=np.bool_)).ordered(SIDE)
+    image = np.zeros((SIDE, SIDE, 3), dtype=np.uint8)
+    for of_tap in ((np.int32, SHORT_BITS), (np.int64, LONG_BITS)):
+        for some in (table, table.narrow((SIDE, SIDE))[0]):
+            paste = Paste([some], (SIDE, SIDE))
+            paste.__dict__["_of_tap"] = of_tap  # as of an image of so many texels
+            paste.paste(image, image, image.copy())
