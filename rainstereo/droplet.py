@@ -39,8 +39,8 @@ class Drop(ABC):
     index: float = WATER
 
     def __post_init__(self) -> None:
-        centre = tuple(float(c) for c in self.centre)
-        if len(centre) != 2 or not all(abs(c) <= CENTRE_LIMIT for c in centre):
+        centre = tuple(map(float, self.centre))
+        if len(centre) != 2 or not (abs(centre[0]) <= CENTRE_LIMIT and abs(centre[1]) <= CENTRE_LIMIT):
             raise ValueError(
                 f"a drop's centre of {self.centre} was given; expected x, y in the panel's plane in metres, within "
                 f"{CENTRE_LIMIT:g} m of the optical axis (12 mm is 0.012)"

@@ -1,8 +1,9 @@
-"""Means over squares of an image that overlap fourfold, so that the nearest one to any place is nearly centred there.
+"""Means over squares of an image that overlap, so that the nearest one to any place is nearly centred there.
 
-A box of 2^k pixels stands at every 2^(k - 2) (those of four pixels, at every second). Box j along an axis is centred on
-the edge between the pixels t j - 1 and t j, t their distance; beyond the image's edges it goes on mirrored, to about a
-pixel. Three channels of bytes stand in a word, 21 bits apart (`rain.words`), 64 times as large.
+Box j of a size along an axis is centred on the edge between the pixels t j - 1 and t j, t the pixels between them;
+beyond the image's edges it goes on mirrored, to about a pixel. Three channels of bytes stand in a word of 32 bits, 10
+bits apart, so that four can be added: small words are read sooner. A size between two others is the mean of both: the
+square of its width is the mean of theirs.
 """
 
 from __future__ import annotations
@@ -11,8 +12,48 @@ from typing import Any
 
 import numpy as np
 
-from .compile import compiled
-from .layout import EVERY
+from .compile import compiled, inlined
+
+BITS = 10  # of a channel in a word
+FIELD, TWICE = np.uint32(BITS), np.uint32(2 * BITS)
+FIRST = np.uint32((1 << BITS) - 1)
+OUTER, MIDDLE = np.uint64(FIRST | (FIRST << TWICE)), np.uint64(FIRST << FIELD)
+WIDE = 20
+"""Bits of a channel in a word that has been spread: the last channel's from 20, the middle one's from 40 on."""
+TO_WIDE = np.uint64(2 * WIDE - BITS)
+LAST = np.uint32((1 << 2 * BITS) + (1 << BITS) + 1)  # bit of each channel
+EVEN = np.uint32(0x3FFFFFFF & ~int(LAST))
+ONE, SHIFT = np.uint64(1), np.uint32(1)
+
+
+@inlined
+def spread(word: Any) -> Any:
+    """A word's channels with room for a million each: sums and weighted sums of such words are those of channels."""
+    word = np.uint64(word)
+    return (word & OUTER) + ((word & MIDDLE) << TO_WIDE)
+
+
+@inlined
+def channels_of(found: Any) -> Any:
+    """The three channels of a sum of words that were spread."""
+    field, most = np.uint64(WIDE), np.uint64((1 << WIDE) - 1)
+    return (
+        np.float32(np.int64(found & most)),
+        np.float32(np.int64(found >> (field + field))),
+        np.float32(np.int64((found >> field) & most)),
+    )
+
+
+@compiled
+def pack(values: Any, words: Any) -> None:
+    """Words of bytes, (N, 1 or 3), as large as they are."""
+    if values.shape[1] == 1:
+        for i in range(np.uint64(len(words))):
+            words[i] = np.uint32(values[i, 0])
+        return
+    for i in range(np.uint64(len(words))):
+        one, two = np.uint32(values[i, np.uint64(1)]) << FIELD, np.uint32(values[i, np.uint64(2)]) << TWICE
+        words[i] = np.uint32(values[i, np.uint64(0)]) | one | two
 
 
 @compiled
@@ -24,50 +65,72 @@ def mirrored(j: Any, last: Any) -> Any:
     return max(j, 0)
 
 
+@inlined
+def _lower(a: Any, b: Any) -> Any:
+    """The mean of two words, channel by channel, rounded down."""
+    return (a & b) + (((a ^ b) & EVEN) >> SHIFT)
+
+
+@inlined
+def _upper(a: Any, b: Any) -> Any:
+    """The same, rounded up."""
+    return (a | b) - (((a ^ b) & EVEN) >> SHIFT)
+
+
+@inlined
+def _either(a: Any, b: Any, up: Any) -> Any:
+    """The same, rounded up in the bits of `up`."""
+    return _lower(a, b) + ((a ^ b) & up)
+
+
+@inlined
+def _mean(a: Any, b: Any, c: Any, d: Any) -> Any:
+    return _upper(_lower(a, b), _lower(c, d))  # too large as often as too small
+
+
 @compiled
-def first_boxes(cells: Any, small: Any, large: Any) -> None:
-    """Boxes of four and of eight pixels, (h + 1, w + 1) each, from means over 2 x 2, (h, w)."""
+def first_boxes(cells: Any, boxes: Any) -> None:
+    """Boxes of four pixels, (h + 1, w + 1), from means over 2 x 2, (h, w)."""
     height, width = cells.shape
-    pairs = np.zeros((4, width + 3), dtype=np.uint64)  # of a row's neighbours, box i at i + 1; a ring of four rows
-    total = np.zeros(width + 3, dtype=np.uint64)
-    one, two, four, wide = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(width)
-    for line in range(-2, height + 2):
-        new, cell = pairs[(line + 4) % 4], cells[_cell(line, height)]
-        for i in range(one, wide):
-            new[i + one] = cell[i - one] + cell[i]
-        for i in (-1, 0, width, width + 1):
-            new[i + 1] = cell[_cell(i - 1, width)] + cell[_cell(i, width)]
-        if line < 1:
-            continue
-        j = line - 1
-        a, b, c, d = pairs[(line + 1) % 4], pairs[(line + 2) % 4], pairs[(line + 3) % 4], new
-        near, far = small[j], large[j]
-        for i in range(wide + one):
-            near[i] = (b[i + one] + c[i + one]) << four
-        for i in range(wide + one + two):
-            total[i] = (a[i] + b[i]) + (c[i] + d[i])
-        for i in range(wide + one):
-            far[i] = (total[i] + total[i + two]) << two
+    for j in range(height + 1):
+        one, other, out = cells[max(j - 1, 0)], cells[min(j, height - 1)], boxes[j]
+        for i in (0, width):
+            a, b = np.uint64(max(i - 1, 0)), np.uint64(min(i, width - 1))
+            out[np.uint64(i)] = _mean(one[a], one[b], other[a], other[b])
+        for i in range(ONE, np.uint64(width)):
+            out[i] = _mean(one[i - ONE], one[i], other[i - ONE], other[i])
 
 
 @compiled
-def _cell(i: Any, count: Any) -> Any:
-    """A cell's number, reflected at the image's edges."""
-    i = -i - 1 if i < 0 else i
-    i = 2 * count - 1 - i if i >= count else i
-    return min(max(i, 0), count - 1)
+def next_boxes(boxes: Any, apart: Any, step: Any, between: Any, larger: Any) -> None:
+    """Boxes of twice the side, (h, w), and those between, at every 1st or 2nd (`step`) of the places of boxes, (H, W).
 
-
-@compiled
-def next_boxes(boxes: Any, larger: Any) -> None:
-    """Boxes of twice the side, (h, w), at every second of the places of boxes, (H, W)."""
+    apart: places from the middle of a larger box to those of the four that make it.
+    """
     height, width = larger.shape
     down, across = boxes.shape[0] - 1, boxes.shape[1] - 1
-    mask = np.uint64(0xFFFF * EVERY)
-    two = np.uint64(2)
+    first = min(-(-apart // step), width)
+    stop = max((across - apart) // step + 1, first)
+    stop = min(stop, width)
+    far, wide = np.uint64(apart), np.uint64(stop)
     for j in range(height):
-        one, other = boxes[mirrored(2 * j - 2, down)], boxes[mirrored(2 * j + 2, down)]
-        out = larger[j]
-        for i in range(width):
-            a, b = np.uint64(mirrored(2 * i - 2, across)), np.uint64(mirrored(2 * i + 2, across))
-            out[np.uint64(i)] = (((one[a] + one[b]) + (other[a] + other[b])) >> two) & mask
+        one, other = boxes[mirrored(step * j - apart, down)], boxes[mirrored(step * j + apart, down)]
+        own, middle, out = boxes[mirrored(step * j, down)], between[j], larger[j]
+        up = LAST if j % 2 else np.uint32(0)  # halves are rounded up in every second row
+        for part in ((0, first), (stop, width)):
+            for i in range(part[0], part[1]):
+                at = step * i
+                a, b = np.uint64(mirrored(at - apart, across)), np.uint64(mirrored(at + apart, across))
+                out[np.uint64(i)] = _mean(one[a], one[b], other[a], other[b])
+                middle[np.uint64(i)] = _either(own[np.uint64(mirrored(at, across))], out[np.uint64(i)], up)
+        if step == 1:
+            for i in range(np.uint64(first), wide):
+                mean = _mean(one[i - far], one[i + far], other[i - far], other[i + far])
+                out[i] = mean
+                middle[i] = _either(own[i], mean, up)
+        else:
+            for i in range(np.uint64(first), wide):
+                at = i + i
+                mean = _mean(one[at - far], one[at + far], other[at - far], other[at + far])
+                out[i] = mean
+                middle[i] = _either(own[at], mean, up)

@@ -7,9 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from .cap_looks import rays_of_words, whole_of_words
-from .cap_rays import BLUE, CAP_SQUARE, GREEN, HALF, HIDDEN, ONE, PLANES, RED, ROOM, ZERO, fit
-from .cap_records import PIXELS, TAPS, record_rays, record_whole
+from .cap_edges import (
+    HOLDS,
+    RAYS,
+    boxes_of_rays,
+    edges_of_words,
+    form_of,
+    has_own,
+    set_out,
+    slopes_of_row,
+    trace_own,
+)
+from .cap_looks import ROUND, is_whole, whole_of_words
+from .cap_rays import CAP_SQUARE, CLEAR, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
+from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
+from .cap_shares import shares_of_row, taken
 from .cap_tiles import (
     AXX,
     AYY,
@@ -18,8 +30,6 @@ from .cap_tiles import (
     CX,
     CY,
     FAR,
-    LIT,
-    LITS,
     OUT_RADIUS,
     OUT_RIVALS,
     TILE,
@@ -28,23 +38,20 @@ from .cap_tiles import (
     hangs_over,
     move_up,
     next_span,
-    own_rays,
     patches,
     row_of_tile,
-    shares_of_row,
-    taken,
     widest,
 )  # fmt: skip
-from .compile import compiled
+from .compile import fused
 from .layout import DRAW, FILL
 
 WHITE = np.float32(255)
 
 
-@compiled
+@fused
 def frame(
     mode: Any, out: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, looks: Any,
-    side: Any, parts: Any, nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
+    nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
     record: Any,
 ) -> None:  # fmt: skip
     """Go over the pixels of caps, in the order of the caps.
@@ -52,17 +59,19 @@ def frame(
     mode: DRAW: into `out`, (H, W, C) of up to three channels of bytes, which holds the clear image, from boxes of the
     scene in `words`. COUNT: how many pixels and taps there are, to record's counters. FILL: write them to record.
     scene: (h, w, C) bytes; only its size matters unless drawing. boxes: starts, widths, inverse distances (`boxes`).
-    border, shift: how the scene goes on, and where the frame is in it. looks: grids, and how many looks each has.
-    side, parts: rays of pixels at edges. nodes, caps, ...: see `cap_rays`, `cap_tiles`.
+    border, shift: how the scene goes on, and where the frame is in it. looks: grids, how many looks each has, how many
+    of the first look at four boxes each, and bands of areas (`cap_tiles`).
+    nodes, caps, ...: see `cap_rays`, `cap_tiles`.
     record: pixels, caps' numbers, taps a pixel, clear shares, displacements, unknown; texels, weights; counters.
     """
     starts, pitches, inverses = boxes
-    grids, counts = looks
+    grids, counts, fines, bands = looks
     height, width = out.shape[0], out.shape[1]
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
     rays, line = np.zeros(PLANES * 64, dtype=np.float32), np.zeros(15, dtype=np.float32)
-    tile, total, at = np.zeros((5, 3, 3), np.float32), np.zeros(4, np.float32), np.zeros(64, np.uint32)
-    most, number_of_looks = len(counts) - 1, counts[0]
+    tile, slopes, total = np.zeros((5, 3, 3), np.float32), np.zeros(12, np.float32), np.zeros(4, np.float32)
+    at, quarters = np.zeros(64 + HOLDS * RAYS, np.uint32), np.zeros(ROUND * 64, np.uint32)
+    slots, held = np.zeros((3, ROUND), np.int64), np.zeros(HOLDS, np.int64)
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
@@ -75,7 +84,9 @@ def frame(
                 reach = (max(lanes, v2 - v1) + 1) // 2
                 u0, v0 = fit(nodes, cap, u1 + lanes // 2, (v1 + v2) // 2, reach, tile)
                 wide, radius = widest(tile), math.sqrt(cap[CAP_SQUARE])
-                edge = 1.45 * radius * wide + wide * wide  # of room: a pixel's corner is 0.71 pixels from its middle
+                edge = np.float32(
+                    1.45 * radius * wide + wide * wide
+                )  # of room: a pixel's corner is 0.71 pixels from its middle
                 hangs, tiny = hangs_over(tile, cap, wide, 1.5 * reach), radius < TINY * wide
                 s, known = np.float32(u1) - u0, False
                 following = next_span(tile, np.float32(v1) - v0, s, lanes, cap, edge, line, rays)
@@ -89,103 +100,109 @@ def frame(
                     if high <= low and not hangs:
                         known = False
                         continue
-                    row_of_tile(tile, t, s, not known, (low, high), following, cap, later, view, line, rays)
+                    begin, end = row_of_tile(
+                        tile, t, s, not known, (low, high), following, cap, later, view, line, rays
+                    )  # fmt: skip
                     known = low < high
-                    patches(rays, low, high, number_of_looks, most, shift, last)
+                    patches(rays, begin, end, bands, shift, last)
                     shares_of_row(tile, t, s, lanes, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
                         taken(tile, t, s, lanes, wide, caps, number, rivals, outline, line, rays)
+                    of_row(tile, t, line)
+                    slopes_of_row(tile, t, slopes)
                     if mode != DRAW:
                         record_row(
-                            mode == FILL, v * width + u1, number, lanes, low, high, tiny, hangs, tile, t, s, edge, cap,
-                            later, view, side, parts, (scene.shape[1], scene.shape[0]), starts, pitches, inverses,
-                            border, shift, grids, counts, rays, at, total, len(words), width, record,
+                            mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, edge, caps,
+                            outlines, later, view, line, slopes, (scene.shape[1], scene.shape[0]), starts, pitches,
+                            inverses, border, shift, grids, counts, fines, rays, at, quarters, total, len(words), width,
+                            record,
                         )  # fmt: skip
                         continue
-                    nothing_shown(rays)
+                    for j in range(np.uint64(3 * 64)):
+                        rays[SHOWN + j] = ZERO
                     if not tiny:
                         whole_of_words(
-                            words, scene, starts, pitches, inverses, last, border, grids, counts, low, high, rays,
-                            total, at,
+                            words, scene, starts, pitches, inverses, last, border, grids, counts, fines, begin, end,
+                            rays, total, at, quarters, slots,
                         )  # fmt: skip
-                    for lane in range(low, high):
-                        j = np.uint64(lane)
-                        if not rays[HIDDEN + j] > ZERO or not (tiny or ZERO < rays[LITS + j] < np.float32(LIT)):
-                            continue
-                        near = not rays[ROOM + j] > edge
-                        share = own_rays(tile, t, s + np.float32(lane), near, cap, later, view, side, parts, rays)
-                        rays[HIDDEN + j] = max(share, rays[HIDDEN + j]) if hangs and not tiny else share
-                        total[0] = total[1] = total[2] = ZERO
-                        rays_of_words(
-                            words, scene, starts, pitches, inverses, last, shift, border, rays, side, parts, total
-                        )
-                        rays[RED + j], rays[GREEN + j], rays[BLUE + j] = total[0], total[1], total[2]
+                    edges_of_words(
+                        words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
+                        later, view, low, high, line, slopes, rays, at, held,
+                    )  # fmt: skip
                     write_bytes(out, v, u1, lanes, rays)
 
 
-@compiled
+@fused
 def record_row(
-    filling: bool, first: Any, number: Any, lanes: Any, low: Any, high: Any, tiny: bool, hangs: bool, tile: Any,
-    t: Any, s: Any, edge: Any, cap: Any, later: Any, view: Any, side: Any, parts: Any, size: Any,
-    starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
-    counts: Any, rays: Any, at: Any, mean: Any, boxes: Any, width: Any, record: Any,
+    filling: bool, u: Any, v: Any, number: Any, lanes: Any, low: Any, high: Any, begin: Any, end: Any, tiny: bool,
+    hangs: bool, s: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
+    line: Any, slopes: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
+    counts: Any, fines: Any, rays: Any, at: Any, quarters: Any, mean: Any, boxes: Any, width: Any, record: Any,
 ) -> None:  # fmt: skip
-    """Count, or write down, a row's pixels. first: number of the pixel of lane 0. boxes: how many there are."""
+    """Count, or write down, a row's pixels. u, v: column of lane 0, and row. boxes: how many there are."""
     pixels, of_caps, taps, clear, moved, unknown, texels, weights, cursor = record
+    last = np.float32(size[0] - 1), np.float32(size[1] - 1)
     for lane in range(lanes):
         j = np.uint64(lane)
         if not rays[HIDDEN + j] > ZERO:
             continue
-        lit = rays[LITS + j] if low <= lane < high else ZERO
         before, off = cursor[TAPS], False
-        mean[0] = mean[1] = np.float32(np.nan)
-        if lit == np.float32(LIT) and not tiny:
+        mean[:] = ZERO
+        if begin <= lane < end and is_whole(rays, j) and not tiny:
             record_whole(
-                starts, pitches, inverses, size, border, grids, counts, rays, lane, boxes, at, texels, weights, cursor,
-                filling,
+                starts, pitches, inverses, size, border, grids, counts, fines, rays, lane, boxes, at, quarters, texels,
+                weights, cursor, filling,
             )  # fmt: skip
             bend = np.float32(1 / 24)
             mean[0] = rays[CX + j] - shift[0] + (rays[AXX + j] + rays[BXX + j]) * bend
             mean[1] = rays[CY + j] - shift[1] + (rays[AYY + j] + rays[BYY + j]) * bend
+            mean[2] = ONE
             off = not rays[FAR + j] >= ZERO
-        elif (lit > ZERO or tiny) and low <= lane < high:
-            near = not rays[ROOM + j] > edge
-            share = own_rays(tile, t, s + np.float32(lane), near, cap, later, view, side, parts, rays)
-            rays[HIDDEN + j] = max(share, rays[HIDDEN + j]) if hangs and not tiny else share
-            off = record_rays(
-                starts, pitches, inverses, size, shift, border, rays, side, parts, boxes, texels, weights, cursor,
-                filling, mean,
-            )  # fmt: skip
+        elif low <= lane < high and has_own(rays, lane, tiny):
+            rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
+            near = bool(rival >= 0 or not rays[ROOM + j] > edge)
+            form = form_of(u + lane, v, outlines[number], tiny, rival)
+            for which in (number, rival):
+                if which >= 0:
+                    hidden += set_out(
+                        s + np.float32(lane), u + lane, v, near, form, which, caps, number, rival, outlines, line,
+                        slopes, rays, np.uint64(0),
+                    )  # fmt: skip
+                    trace_own(caps[which], later, view, rays, RAYS)
+                    off |= add_places(rays, shift, last, mean)
+                    boxes_of_rays(outlines[which], last, shift, border, len(starts), rays, RAYS, at)
+                    record_rays(starts, size, rays, at, boxes, texels, weights, cursor, filling)
+            rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
         if not rays[HIDDEN + j] > ZERO:
             cursor[TAPS] = before
             continue
         if filling:
-            row, pixel = cursor[PIXELS], first + lane
+            row, pixel = cursor[PIXELS], v * width + u + lane
             pixels[row], of_caps[row], taps[row] = pixel, number, cursor[TAPS] - before
             clear[row], unknown[row] = max(ONE - rays[HIDDEN + j], ZERO), off
-            moved[row, 0] = mean[0] - np.float32(pixel % width)
-            moved[row, 1] = mean[1] - np.float32(pixel // width)
+            moved[row, 0] = mean[0] / mean[2] - np.float32(u + lane) if mean[2] > ZERO else np.float32(np.nan)
+            moved[row, 1] = mean[1] / mean[2] - np.float32(v) if mean[2] > ZERO else np.float32(np.nan)
         cursor[PIXELS] += 1
 
 
-@compiled
-def nothing_shown(rays: Any) -> None:
-    """Of a row, to begin with."""
-    for j in range(np.uint64(3 * 64)):
-        rays[RED + j] = ZERO
-
-
-@compiled
+@fused
 def write_bytes(out: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
     """Mix what a row shows with what is there, where a cap hides it."""
-    channels = np.uint64(out.shape[2])
-    row, plane = out[v].ravel(), np.uint64(64)
+    channels, three, block = np.uint64(out.shape[2]), np.uint64(3), np.uint64(32)
+    row, first = out[v].ravel(), np.uint64(u) * channels
+    for j in range(np.uint64(64)):
+        for channel in range(three):
+            rays[CLEAR + three * j + channel] = ONE - rays[HIDDEN + j]
+    if channels == three:
+        count = (
+            (three * np.uint64(lanes) + block - np.uint64(1)) // block * block
+        )  # whole vectors: beyond, all is clear
+        for k in range(min(count, np.uint64(len(row)) - first)):
+            value = rays[SHOWN + k] + rays[CLEAR + k] * np.float32(row[first + k]) + HALF
+            row[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))
+        return
     for j in range(np.uint64(lanes)):
-        hidden = rays[HIDDEN + j]
-        if hidden > ZERO:
-            at = (np.uint64(u) + j) * channels
-            for channel in range(channels):
-                value = rays[RED + plane * channel + j] + HALF
-                if hidden < ONE:
-                    value += (ONE - hidden) * np.float32(row[at + channel])
-                row[at + channel] = np.uint8(np.int32(value if value < WHITE else WHITE))
+        for channel in range(channels):
+            k, at = three * j + channel, first + j * channels + channel
+            value = rays[SHOWN + k] + rays[CLEAR + k] * np.float32(row[at]) + HALF
+            row[at] = np.uint8(np.int32(value if value < WHITE else WHITE))

@@ -15,18 +15,24 @@ from typing import Any
 
 import numpy as np
 
-from .compile import inlined
+from .compile import fused_part
 
 PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
 OWN, SIDES, ABOVE, BELOW = (np.uint64(64 * i) for i in (11, 14, 17, 20))
-"""Rays of a row of pixels: through their middles, their left and right sides, and above and below; places, and gain."""
+"""Rays of a row of pixels: through their middles, the middles of their left sides, and their upper and lower left
+corners; places, and gain."""
 SUB = np.uint64(64 * 23)  # of one pixel
 PATCH = np.uint64(64 * 26)
-HIDDEN, RED, GREEN, BLUE = (np.uint64(64 * i) for i in (43, 44, 45, 46))
-"""Of a row: the share of each pixel that a cap hides, and what it shows there."""
-STEPS = np.uint64(64 * 47)
-"""From a pixel's own rays to their neighbours: pairs of planes."""
-PLANES = 73
+HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))
+"""Of a row: the share of each pixel that a cap hides; and 1 + the number of another that shows some of it, or 0."""
+SHOWN, CLEAR = np.uint64(64 * 45), np.uint64(64 * 48)
+"""What a row shows, three channels a pixel, and the share that is clear, thrice."""
+WEIGHT, STRETCH = np.uint64(64 * 51), np.uint64(64 * 52)
+SPREAD, PER = np.uint64(64 * 53), np.uint64(64 * 54)
+"""Of a pixel's own rays: see `cross`, and how a box's size follows from how far a ray looks (`cap_edges`)."""
+HELD = np.uint64(64 * 55)
+"""Weights of rays whose boxes are on their way from memory."""
+PLANES = 83
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
@@ -44,7 +50,7 @@ STEP = 8  # pixels between nodes
 X_NODE, Y_NODE, KX_NODE, KY_NODE, DIM_NODE = range(5)
 
 
-@inlined
+@fused_part
 def fit(nodes: Any, cap: Any, u: Any, v: Any, reach: Any, tile: Any) -> Any:
     """Polynomials of x, y, kx, ky and dimming over a tile, (5, 3, 3) float32, and the pixel that they are about.
 
@@ -74,7 +80,7 @@ def fit(nodes: Any, cap: Any, u: Any, v: Any, reach: Any, tile: Any) -> Any:
     return np.float32(i * STEP), np.float32(j * STEP)
 
 
-@inlined
+@fused_part
 def of_row(tile: Any, t: Any, line: Any) -> None:
     """The polynomials, (15,), of a row, t pixels from that which a tile's are about."""
     for plane in range(5):
@@ -82,7 +88,7 @@ def of_row(tile: Any, t: Any, line: Any) -> None:
             line[3 * plane + power] = tile[plane, 0, power] + t * (tile[plane, 1, power] + t * tile[plane, 2, power])
 
 
-@inlined
+@fused_part
 def take_up(line: Any, s: Any, low: Any, high: Any, rays: Any) -> None:
     """Rays of lanes low to before high, s + lane pixels along a row."""
     x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
@@ -97,7 +103,7 @@ def take_up(line: Any, s: Any, low: Any, high: Any, rays: Any) -> None:
         rays[DIM + j] = d0 + at * (d1 + at * d2)
 
 
-@inlined
+@fused_part
 def room_of_row(line: Any, s: Any, lanes: Any, square: Any, rays: Any) -> None:
     """Contact radius squared less the square of the distance from the centre, of a row's rays on the face."""
     x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
@@ -107,17 +113,23 @@ def room_of_row(line: Any, s: Any, lanes: Any, square: Any, rays: Any) -> None:
         rays[NEXT + j] = square - x * x - y * y
 
 
-@inlined
-def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: Any) -> None:
+@fused_part
+def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: Any, soft: bool) -> None:
     """Rays that have been taken up, through the cap, the rest of the chamber and to the scene; written from `to` on.
 
     The gain is 0 where no light comes through. later: (F, 3) float32, thickness before a face and the indices
     on both sides, of the faces behind the cap's.
+    soft: each ray stands for light about it, over which the square of the wave vector's component along the normal
+    behind the cap goes from `SPREAD` below to as much above the ray's. That component is what places and gains depend
+    on, nearly linearly, also where it ends, at the critical angle, and they as steeply as a square root: so its mean
+    gives the light's gain, and its mean weighted with itself the light's middle. The plane `STRETCH` gets the component
+    before the cap's surface over that behind it.
     """
     square, depth, curvature = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH]), np.float32(cap[CAP_CURVATURE])
     n = np.float32(cap[CAP_INDEX])
     q = n * n
-    over = (ONE - q) * curvature
+    inverse, less = ONE / q, ONE - q
+    a_third, a_fourth = np.float32(1 / 3), np.float32(0.25)
     first, last = np.uint64(low), np.uint64(high)
     for j in range(first, last):
         px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
@@ -126,18 +138,29 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
         b = kz * depth + px * kx + py * ky
         root = np.float32(math.sqrt(b * b + room * q))
         # the root of the quadratic, as the product of both roots over the other
-        s = room / (b + root) if b >= ZERO else (root - b) / q
+        s = room / (b + root) if b >= ZERO else (root - b) * inverse
         before = root * curvature  # component of the wave vector along the sphere's normal
-        inside = before * before + (ONE - q)
-        turned = np.float32(math.sqrt(inside))
-        bend = over / (turned + before)
+        inside = before * before + less
+        turned = mean = np.float32(math.sqrt(inside))
+        if soft:
+            spread = rays[SPREAD + j]
+            per = ONE / spread
+            high, low_ = inside + spread, inside - spread
+            high, low_ = (high if high > ZERO else ZERO), (low_ if low_ > ZERO else ZERO)
+            mean = (high * np.float32(math.sqrt(high)) - low_ * np.float32(math.sqrt(low_))) * (a_third * per)
+            turned = (high + low_) * (high - low_) * (a_fourth * per) / (mean if mean > ZERO else ONE)
+            inside = high
         p, t = before + q * turned, before + turned
-        pt = p * t
-        passed = (before * turned + before * turned) * (p * p + q * t * t) / (pt * pt)
+        both = ONE / (p * t)
+        bend = less * curvature * (p * both)
+        passed = (before * mean + before * mean) * (p * p + q * t * t) * (both * both)
         rise = s * kz
         px += s * kx
         py += s * ky
         up = kz + bend * (rise + depth)
+        if soft:
+            drawn_out = before / turned
+            rays[STRETCH + j] = drawn_out if turned > ZERO else ZERO
         rays[PX + j] = px
         rays[PY + j] = py
         rays[RISE + j] = rise
@@ -165,7 +188,7 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
     _project(np.float32(cap[CAP_X]), np.float32(cap[CAP_Y]), view, rays, first, last, to)
 
 
-@inlined
+@fused_part
 def _project(cx: Any, cy: Any, view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
     """Where the camera sees what the rays meet at the scene's depth."""
     m0, m1, m2, m3, m4, m5, m6, m7, m8 = view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8]
@@ -187,7 +210,7 @@ def _project(cx: Any, cy: Any, view: Any, rays: Any, first: Any, last: Any, to: 
         _distort(view, rays, first, last, to)
 
 
-@inlined
+@fused_part
 def _distort(view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
     """The lens's distortion of places; what lies beyond the radius where it folds back goes to that radius."""
     u0, v0, fold = view[VIEW_C], view[VIEW_C + 1], view[VIEW_FOLD]

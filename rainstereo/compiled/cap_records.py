@@ -6,15 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from .cap_looks import AREAS, WIDER, areas, folded, look_at, places, sides, size_of
-from .cap_rays import GAIN, HALF, HIDDEN, ONE, SHARE, SUB, Y_, ZERO
-from .cap_tiles import ACROSS, AREA, FAR, GAINS
-from .compile import compiled, inlined
+from .cap_edges import LANES, NO_BOX, SIZE_BITS
+from .cap_looks import INSIDE, OF_GRID, look_at, places, sides, size_of
+from .cap_rays import HIDDEN, ONE, SUB, WEIGHT, Y_, ZERO
+from .cap_tiles import FAR, GAINS, GRID, PART
+from .compile import fused, fused_part
 
 PIXELS, TAPS = 0, 1  # counters
 
 
-@inlined
+@fused_part
 def _tap(texels: Any, weights: Any, cursor: Any, filling: bool, texel: Any, weight: Any) -> None:
     if filling:
         texels[cursor[TAPS]] = texel
@@ -22,7 +23,7 @@ def _tap(texels: Any, weights: Any, cursor: Any, filling: bool, texel: Any, weig
     cursor[TAPS] += 1
 
 
-@inlined
+@fused_part
 def _bilinear(
     texels: Any, weights: Any, cursor: Any, filling: bool, first: Any, size: Any, x: Any, y: Any,
     weight: Any,
@@ -36,65 +37,66 @@ def _bilinear(
             _tap(texels, weights, cursor, filling, first + row * size[0] + column, weight * a * b)
 
 
-@compiled
+@fused
 def record_whole(
-    starts: Any, pitches: Any, inverses: Any, size: Any, border: Any, grids: Any,
-    counts: Any, rays: Any, lane: Any, first: Any, at: Any, texels: Any, weights: Any, cursor: Any,
-    filling: bool,
+    starts: Any, pitches: Any, inverses: Any, size: Any, border: Any, grids: Any, counts: Any, fines: Any, rays: Any,
+    lane: Any, first: Any, at: Any, parts: Any, texels: Any, weights: Any, cursor: Any, filling: bool,
 ) -> None:  # fmt: skip
     """The taps of a pixel all of whose rays are lit. first: number of the image's first pixel among the texels."""
-    j = np.uint64(lane)
+    j, begin = np.uint64(lane), np.uint64(0)
     last = np.float32(size[0] - 1), np.float32(size[1] - 1)
-    across = int(rays[ACROSS + j])
-    count = counts[across]
-    k = size_of(WIDER * rays[AREA + j] / np.float32(count), len(inverses))
+    k, grid = size_of(rays[PART + j], len(inverses)), np.uint64(rays[GRID + j])
     gain = rays[GAINS + j] * rays[HIDDEN + j]
-    if k >= 0:
-        places(
-            inverses[k], pitches[k], last, border, not rays[FAR + j] >= ZERO, rays, j, grids, 320 * across, count, at
-        )
-        for look in range(count):
-            _tap(texels, weights, cursor, filling, starts[k] + np.int64(at[look]), gain / np.float32(count))
+    if k < 0:
+        across, down = sides(rays, j)
+        for b in range(down):
+            for a in range(across):
+                x, y = look_at(rays, j, a, b, across, down, last, border)
+                _bilinear(texels, weights, cursor, filling, first, size, x, y, gain / np.float32(across * down))
         return
-    across, down = sides(rays, j)
-    part = gain / np.float32(across * down)
-    for b in range(down):
-        for a in range(across):
-            x, y = look_at(rays, j, a, b, across, down, last, border)
-            _bilinear(texels, weights, cursor, filling, first, size, x, y, part)
+    start, pitch, inverse, count = starts[k], pitches[k], inverses[k], counts[grid]
+    on, part = border if not rays[FAR + j] >= ZERO else INSIDE, gain / np.float32(count)
+    if grid < np.uint64(fines):
+        places(True, start, pitch, inverse, last, on, rays, j, grids, grid * OF_GRID, count, at, begin, parts)
+        for look in range(np.uint64(count)):
+            box, far = np.int64(at[look]), np.int64(parts[look])
+            u, v = np.float32(far & 3) / np.float32(4), np.float32(far >> 2) / np.float32(4)
+            _tap(texels, weights, cursor, filling, box, part * (ONE - v) * (ONE - u))
+            _tap(texels, weights, cursor, filling, box + 1, part * (ONE - v) * u)
+            _tap(texels, weights, cursor, filling, box + pitch, part * v * (ONE - u))
+            _tap(texels, weights, cursor, filling, box + pitch + 1, part * v * u)
+        return
+    places(False, start, pitch, inverse, last, on, rays, j, grids, grid * OF_GRID, count, at, begin, parts)
+    for look in range(np.uint64(count)):
+        _tap(texels, weights, cursor, filling, np.int64(at[look]), part)
 
 
-@compiled
+@fused
 def record_rays(
-    starts: Any, pitches: Any, inverses: Any, size: Any, shift: Any, border: Any,
-    rays: Any, side: Any, parts: Any, first: Any, texels: Any, weights: Any, cursor: Any, filling: bool,
-    mean: Any,
-) -> bool:  # fmt: skip
-    """The taps of a pixel with rays of its own; the mean place of those that are lit; whether one is off the image."""
-    areas(rays, side, parts)
-    part, lit, off = ONE / np.float32(side * side), 0, False
-    last = np.float32(size[0] - 1), np.float32(size[1] - 1)
-    mean[0] = mean[1] = ZERO
-    for j in range(np.uint64(side * side)):
-        k = SUB + j
-        weight = rays[k + GAIN]
+    starts: Any, size: Any, rays: Any, at: Any, first: Any, texels: Any, weights: Any, cursor: Any, filling: bool,
+) -> None:  # fmt: skip
+    """The taps of a pixel with rays of its own, see `cap_edges.boxes_of_rays`."""
+    for j in range(LANES):
+        weight, box = rays[WEIGHT + j], np.int64(at[j])
         if not weight > ZERO:
             continue
-        weight *= rays[SHARE + j] * part
-        u, v = rays[k] + shift[0], rays[k + Y_] + shift[1]
-        if rays[SHARE + j] > ZERO:
-            off |= u < ZERO or v < ZERO or u > last[0] or v > last[1]
-            mean[0] += rays[k]
-            mean[1] += rays[k + Y_]
-            lit += 1
-        x, y = folded(u, last[0], border), folded(v, last[1], border)
-        level = size_of(rays[AREAS + j], len(inverses))
-        if level < 0:
-            _bilinear(texels, weights, cursor, filling, first, size, x, y, weight)
+        kind = box >> SIZE_BITS
+        if kind == NO_BOX:
+            _bilinear(texels, weights, cursor, filling, first, size, rays[SUB + j], rays[SUB + Y_ + j], weight)
         else:
-            one = inverses[level]
-            row, column = int(y * one + (HALF * one + HALF)), int(x * one + (HALF * one + HALF))
-            _tap(texels, weights, cursor, filling, starts[level] + row * pitches[level] + column, weight)
-    mean[0] = mean[0] / np.float32(lit) if lit else np.float32(np.nan)
-    mean[1] = mean[1] / np.float32(lit) if lit else np.float32(np.nan)
+            _tap(texels, weights, cursor, filling, starts[kind] + (box & ((1 << SIZE_BITS) - 1)), weight)
+
+
+@fused_part
+def add_places(rays: Any, shift: Any, last: Any, mean: Any) -> bool:
+    """Add the places of a pixel's own rays that show something, and how many, to `mean`; say whether one is off the
+    scene."""
+    off = False
+    for j in range(LANES):
+        if rays[WEIGHT + j] > ZERO:
+            u, v = rays[SUB + j] + shift[0], rays[SUB + Y_ + j] + shift[1]
+            off |= u < ZERO or v < ZERO or u > last[0] or v > last[1]
+            mean[0] += rays[SUB + j]
+            mean[1] += rays[SUB + Y_ + j]
+            mean[2] += ONE
     return off

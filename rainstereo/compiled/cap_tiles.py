@@ -1,8 +1,8 @@
-"""Tiles of caps, row by row: their rays, how much of each pixel a cap hides, and what patch of the scene it shows.
+"""Tiles of caps, row by row: their rays, and what patch of the scene each pixel shows.
 
-A pixel's ray goes through its middle; four more, through the middles of its sides, it shares with its neighbours. What
-it shows is then known as a quadratic in the place on the pixel. How much of a pixel lies inside the contact circle is
-exact for a straight line.
+Rays go through the corners of pixels and the middles of their left and right sides, which neighbours share; where all
+six of a pixel are lit, one more goes through its middle. What it shows is then known as a quadratic in the place on the
+pixel. Where a cap is lit is convex, or nearly so: four lit corners are a lit pixel.
 """
 
 from __future__ import annotations
@@ -15,29 +15,16 @@ import numpy as np
 from .cap_rays import (
     ABOVE,
     BELOW,
-    CAP_CURVATURE,
     CAP_DEPTH,
     CAP_SQUARE,
-    CAP_X,
-    CAP_Y,
-    DIM,
     FOUR,
-    FREE,
     GAIN,
     HALF,
-    HIDDEN,
-    KX,
-    KY,
     NEXT,
-    ONE,
     OWN,
     PATCH,
-    PX,
-    PY,
     ROOM,
-    SHARE,
     SIDES,
-    SUB,
     Y_,
     ZERO,
     cross,
@@ -45,25 +32,29 @@ from .cap_rays import (
     room_of_row,
     take_up,
 )  # fmt: skip
-from .compile import compiled, inlined
+from .compile import fused, fused_part
 
 TILE = 56  # pixels along a side, at most
 TINY = 2.5
 """Contact radius, pixels, below which all pixels of a cap have many rays of their own."""
 OUT_X, OUT_Y, OUT_RADIUS, OUT_RIVAL, OUT_RIVALS = range(5)
 """Columns of a table of outlines, float64: a circle in the image, and which of the list of rivals are the cap's."""
-SIDE = 4  # samples along a pixel's side where a cap hangs over
-LIT = 5  # rays of a pixel
-ALIKE = 1e-6  # of a cap's room: less of a difference is rounding
-CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, AREA, ACROSS, FAR, LITS = (
+WHOLE, PARTLY = np.float32(2), np.float32(1)
+"""Of a pixel's rays beside it, whether all or only some are lit."""
+CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, PART, GRID, FAR, LITS = (
     PATCH + np.uint64(64 * i) for i in range(17)
 )  # fmt: skip
-"""Planes of patches: where a pixel's middle looks; how that changes along x (A) and y (B), twice along each, and along
-both; mean gain; area, square pixels; looks along x; pixels between what it shows and the scene's edge, at least; how
-many rays are lit, less a little where one beside a corner is not."""
+"""Planes of patches: the middle of what a pixel shows; how places change along x (A) and y (B), twice along each, and
+along both; mean gain; area, square pixels, that one look stands for; the number of the grid of looks; pixels between
+what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0."""
+AREAS, AIMS, FIRSTS, PARTS = range(4)
+"""Columns of a table of bands: up to which area of a patch, how many looks it gets, from which grid on, and
+which part of the patch's area a box has."""
+LARGEST = np.float32(110 * 110)
+"""Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
 
 
-@inlined
+@fused_part
 def bounds(outline: Any, width: Any, height: Any) -> Any:
     """Columns and rows of the image, firsts and those after the last, that an outline touches."""
     x, y, reach = outline[OUT_X], outline[OUT_Y], min(outline[OUT_RADIUS], 1e9)
@@ -74,7 +65,7 @@ def bounds(outline: Any, width: Any, height: Any) -> Any:
     return left, right, top, bottom
 
 
-@inlined
+@fused_part
 def widest(tile: Any) -> Any:
     """How far apart rays that are a pixel apart meet the face, metres, at most: the larger singular value."""
     xu, xv, yu, yv = tile[0, 0, 1], tile[0, 1, 0], tile[1, 0, 1], tile[1, 1, 0]
@@ -82,7 +73,7 @@ def widest(tile: Any) -> Any:
     return 1.02 * math.sqrt(0.5 * (total + math.sqrt(max(total * total - area * area, 0.0))))
 
 
-@inlined
+@fused_part
 def hangs_over(tile: Any, cap: Any, wide: Any, reach: Any) -> Any:
     """Whether rays beside a cap may run into its side."""
     kx = abs(tile[2, 0, 0]) + reach * (abs(tile[2, 0, 1]) + abs(tile[2, 1, 0]))
@@ -92,7 +83,7 @@ def hangs_over(tile: Any, cap: Any, wide: Any, reach: Any) -> Any:
     return math.sqrt(square) * out > math.sqrt(max(1 - square, 0.0)) * cap[CAP_DEPTH]
 
 
-@compiled
+@fused_part
 def next_span(tile: Any, t: Any, s: Any, lanes: Any, cap: Any, slack: Any, line: Any, rays: Any) -> Any:
     """Fill the plane of room of a row, and say between which lanes its rays meet the contact circle, or nearly."""
     of_row(tile, t, line)
@@ -105,106 +96,135 @@ def next_span(tile: Any, t: Any, s: Any, lanes: Any, cap: Any, slack: Any, line:
     return low, high
 
 
-@compiled
+@fused
 def trace_lanes(
     tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, later: Any, view: Any, line: Any,
     rays: Any, to: Any,
 ) -> None:  # fmt: skip
-    """Rays of a row, t and s pixels from the tile's own, to planes from `to` on; for whole vectors of lanes."""
+    """Rays of a row, t and s pixels from the tile's own, to planes from `to` on; lanes from `low`, whole vectors."""
     of_row(tile, t, line)
-    begin, end = low // 8 * 8, (high + 7) // 8 * 8
-    take_up(line, s, begin, end, rays)
-    cross(cap, later, view, rays, begin, end, to)
+    end = low + (high - low + 7) // 8 * 8
+    take_up(line, s, low, end, rays)
+    cross(cap, later, view, rays, low, end, to, False)
 
 
-@inlined
-def bent(rays: Any, j: Any, crossed: Any) -> Any:
-    """A coordinate of what a pixel shows, as a quadratic in the place on it: `CX`, `AX`, `BX`, `AXX`, `BXX`, `ABX`; and
-    how far from its middle's it goes, at most. j: of the lane, among x or y. crossed: no more than 0 if a ray beside a
-    corner is dark."""
-    quarter, eighth, one, two = np.float32(0.25), np.float32(0.125), np.uint64(1), np.uint64(2)
+@fused_part
+def row_of_tile(
+    tile: Any, t: Any, s: Any, is_first: bool, span: Any, following: Any, cap: Any,
+    later: Any, view: Any, line: Any, rays: Any,
+) -> Any:  # fmt: skip
+    """Trace a row of pixels between the lanes of its span, and the corners below, of its own and of the following span.
+
+    t, s: pixels from the tile's own to the row, and to lane 0. is_first: what is above is not known from before.
+    Returns the first lane all of whose rays beside it are lit, and that after the last.
+    """
+    low, high = span
+    if low < high:
+        trace_lanes(tile, t, s - HALF, low, high + 1, cap, later, view, line, rays, SIDES)
+        if is_first:
+            trace_lanes(tile, t - HALF, s - HALF, low, high + 1, cap, later, view, line, rays, ABOVE)
+    first, last = span
+    if following[0] < following[1]:
+        first, last = (min(low, following[0]), max(high, following[1])) if low < high else following
+    if first < last:
+        trace_lanes(tile, t + HALF, s - HALF, first, last + 1, cap, later, view, line, rays, BELOW)
+    if not low < high:
+        return 0, 0
+    lit(rays, low, high)
+    while low < high and rays[LITS + np.uint64(low)] != WHOLE:
+        low += 1
+    while low < high and rays[LITS + np.uint64(high - 1)] != WHOLE:
+        high -= 1
+    if low < high:
+        trace_lanes(tile, t, s, low, high, cap, later, view, line, rays, OWN)
+    return low, high
+
+
+@fused_part
+def lit(rays: Any, low: Any, high: Any) -> None:
+    """Fill the plane `LITS` from low to before high."""
+    one = np.uint64(1)
+    for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
+        a, b, c = rays[SIDES + GAIN + j], rays[ABOVE + GAIN + j], rays[BELOW + GAIN + j]
+        d, e, f = rays[SIDES + GAIN + j + one], rays[ABOVE + GAIN + j + one], rays[BELOW + GAIN + j + one]
+        p, q, r, u = (a if a < b else b), (c if c < d else d), (a if a > b else b), (c if c > d else d)
+        v, w = (e if e < f else f), (e if e > f else f)
+        p, r = (p if p < q else q), (r if r > u else u)
+        least, most = (p if p < v else v), (r if r > w else w)
+        rays[LITS + j] = WHOLE if least > ZERO else PARTLY if most > ZERO else ZERO
+
+
+@fused_part
+def bent(rays: Any, j: Any) -> Any:
+    """What rays have of a pixel, as a quadratic in the place on it: `CX`, `AX`, `BX`, `AXX`, `BXX`, `ABX`. j: of the
+    lane, among x, y or gains."""
+    one = np.uint64(1)
     c, a, b = rays[OWN + j], rays[SIDES + j], rays[SIDES + j + one]
-    d, e = rays[ABOVE + j + one], rays[BELOW + j + one]
-    mixed = (rays[BELOW + j + two] - rays[BELOW + j]) - (rays[ABOVE + j + two] - rays[ABOVE + j])
-    mixed = HALF * mixed if crossed > ZERO else ZERO  # what is beside a dark ray may be NaN
-    ax, bx, axx, bxx = b - a, e - d, FOUR * (a + b - c - c), FOUR * (d + e - c - c)
-    reach = HALF * (abs(ax) + abs(bx)) + eighth * (abs(axx) + abs(bxx)) + quarter * abs(mixed)
-    return c, ax, bx, axx, bxx, mixed, reach
+    d, e, f, g = rays[ABOVE + j], rays[ABOVE + j + one], rays[BELOW + j], rays[BELOW + j + one]
+    left, right = f - d, g - e
+    ax, bx, mixed = b - a, HALF * (left + right), right - left
+    axx = FOUR * (a + b - c - c)
+    bxx = ((d + f) - (a + a)) + ((e + g) - (b + b))
+    return c, ax, bx, axx, bxx + bxx, mixed
 
 
-@compiled
-def patches(rays: Any, low: Any, high: Any, looks: Any, most: Any, shift: Any, last: Any) -> None:
-    """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel."""
-    sixth = np.float32(1 / 6)
-    one, two = np.uint64(1), np.uint64(2)
+@fused_part
+def reach(ax: Any, bx: Any, axx: Any, bxx: Any, mixed: Any) -> Any:
+    """How far from its middle's what a pixel shows goes, at most."""
+    return HALF * (abs(ax) + abs(bx)) + np.float32(0.125) * (abs(axx) + abs(bxx)) + np.float32(0.25) * abs(mixed)
+
+
+@fused_part
+def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -> None:
+    """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel.
+
+    bands: (4, 4), see `AREAS`.
+    """
     dx, dy, end_x, end_y = shift[0], shift[1], last[0], last[1]
-    number, limit, fewest = np.float32(looks), np.float32(most), np.float32(min(2, most))
-    for j in range(np.uint64(low // 8 * 8), np.uint64((high + 7) // 8 * 8)):
-        p, q = rays[ABOVE + GAIN + j], rays[ABOVE + GAIN + j + two]
-        p = p if p < q else q
-        q = rays[BELOW + GAIN + j]
-        p = p if p < q else q
-        q = rays[BELOW + GAIN + j + two]
-        p = p if p < q else q
-        crossed = p
-        c, ax, bx, axx, bxx, mixed, rx = bent(rays, j, crossed)
-        cx = c + dx
+    area1, area2, area3 = bands[0, AREAS], bands[1, AREAS], bands[2, AREAS]
+    aim0, aim1, aim2, aim3 = bands[0, AIMS], bands[1, AIMS], bands[2, AIMS], bands[3, AIMS]
+    first0, first1, first2, first3 = bands[0, FIRSTS], bands[1, FIRSTS], bands[2, FIRSTS], bands[3, FIRSTS]
+    part0, part1, part2, part3 = bands[0, PARTS], bands[1, PARTS], bands[2, PARTS], bands[3, PARTS]
+    small, two, twelfth = np.float32(1 / 24), np.float32(2), np.float32(1 / 12)
+    for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
+        g, ag, bg, agg, bgg, _ = bent(rays, GAIN + j)
+        gain = g + (agg + bgg) * small
+        rays[GAINS + j] = gain
+        per = twelfth / gain  # what is brighter counts more: it is as if the middle lay there
+        cx, ax, bx, axx, bxx, mixed = bent(rays, j)
+        cx += dx + (ag * ax + bg * bx) * per
+        p, q = cx - reach(ax, bx, axx, bxx, mixed), end_x - cx - reach(ax, bx, axx, bxx, mixed)
+        far = p if p < q else q
         rays[CX + j] = cx
         rays[AX + j] = ax
         rays[BX + j] = bx
         rays[AXX + j] = axx
         rays[BXX + j] = bxx
         rays[ABX + j] = mixed
-        c, ay, by, ayy, byy, mixed, ry = bent(rays, Y_ + j, crossed)
-        cy = c + dy
+        cy, ay, by, ayy, byy, mixed = bent(rays, Y_ + j)
+        cy += dy + (ag * ay + bg * by) * per
+        p, q = cy - reach(ay, by, ayy, byy, mixed), end_y - cy - reach(ay, by, ayy, byy, mixed)
+        p = p if p < q else q
         rays[CY + j] = cy
         rays[AY + j] = ay
         rays[BY + j] = by
         rays[AYY + j] = ayy
         rays[BYY + j] = byy
         rays[ABY + j] = mixed
-        p, q = cx - rx, cy - ry
-        p = p if p < q else q
-        q = end_x - (cx + rx)
-        p = p if p < q else q
-        q = end_y - (cy + ry)
-        rays[FAR + j] = p if p < q else q
-        rays[AREA + j] = abs(ax * by - ay * bx)
-        long, wide = ax * ax + ay * ay, bx * bx + by * by
-        ratio = np.float32(math.sqrt(long / (wide + np.float32(1e-9))))
-        across = np.float32(math.sqrt(number * ratio)) + HALF
-        across = across if across < limit else limit
-        rays[ACROSS + j] = across if across > fewest else fewest
-        g, a, b = rays[OWN + GAIN + j], rays[SIDES + GAIN + j], rays[SIDES + GAIN + j + one]
-        d, e = rays[ABOVE + GAIN + j + one], rays[BELOW + GAIN + j + one]
-        rays[GAINS + j] = g + (a + b + d + e - FOUR * g) * sixth
-        lit = (ONE if g > ZERO else ZERO) + (ONE if a > ZERO else ZERO) + (ONE if b > ZERO else ZERO)
-        lit += (ONE if d > ZERO else ZERO) + (ONE if e > ZERO else ZERO)
-        rays[LITS + j] = lit if crossed > ZERO else lit * np.float32(0.9)
+        rays[FAR + j] = far if far < p else p
+        area = abs(ax * by - ay * bx)
+        aim, first, part = (aim0, first0, part0) if area < area1 else (aim1, first1, part1)
+        aim, first, part = (aim, first, part) if area < area2 else (aim2, first2, part2)
+        aim, first, part = (aim, first, part) if area < area3 else (aim3, first3, part3)
+        rays[PART + j] = area * part
+        rays[LITS + j] = rays[LITS + j] if area < LARGEST else PARTLY
+        ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))
+        across = np.float32(math.sqrt(aim * np.float32(math.sqrt(ratio)))) + HALF
+        across = across if across < HALF * aim else HALF * aim
+        rays[GRID + j] = first + (across if across > two else two)
 
 
-@compiled
-def row_of_tile(
-    tile: Any, t: Any, s: Any, is_first: bool, span: Any, following: Any, cap: Any,
-    later: Any, view: Any, line: Any, rays: Any,
-) -> None:  # fmt: skip
-    """Trace a row of pixels between the lanes of its span, and what is below, of its own and of the following span.
-
-    t, s: pixels from the tile's own to the row, and to lane 0. is_first: what is above is not known from before.
-    """
-    low, high = span
-    if low < high:
-        trace_lanes(tile, t, s, low, high, cap, later, view, line, rays, OWN)
-        trace_lanes(tile, t, s - HALF, low, high + 1, cap, later, view, line, rays, SIDES)
-    if is_first and low < high:
-        trace_lanes(tile, t - HALF, s - ONE, low, high + 2, cap, later, view, line, rays, ABOVE)
-    if following[0] < following[1]:
-        low, high = (min(low, following[0]), max(high, following[1])) if low < high else following
-    if low < high:
-        trace_lanes(tile, t + HALF, s - ONE, low, high + 2, cap, later, view, line, rays, BELOW)
-
-
-@compiled
+@fused_part
 def move_up(rays: Any) -> None:
     """What was below a row is above the next, and what was next to come is at hand."""
     for j in range(np.uint64(3 * 64)):
@@ -213,205 +233,26 @@ def move_up(rays: Any) -> None:
         rays[ROOM + j] = rays[NEXT + j]
 
 
-# -- shares ------------------------------------------------------------------------------------------------------------
-
-
-@inlined
-def beside_line(nx: Any, ny: Any, distance: Any) -> Any:
-    """Share of a unit square within `distance` along the unit normal nx, ny from its middle."""
-    a, b = max(abs(nx), abs(ny)), min(abs(nx), abs(ny))
-    far = abs(distance)
-    if far <= HALF * (a - b):
-        return HALF + distance / a
-    rest = max(HALF * (a + b) - far, ZERO)
-    share = rest * rest / max((a + a) * b, np.float32(1e-12))
-    return ONE - share if distance > ZERO else share
-
-
-@inlined
-def contact_share(px: Any, py: Any, radius: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
-    """Share of a pixel inside the contact circle; xu, ...: metres on the face a pixel."""
-    r = np.float32(math.sqrt(px * px + py * py))
-    if r < np.float32(1e-3) * radius:
-        return ONE
-    gu, gv = (px * xu + py * yu) / r, (px * xv + py * yv) / r
-    slope = np.float32(math.sqrt(gu * gu + gv * gv))
-    return beside_line(gu / slope, gv / slope, (radius - r) / slope)
-
-
-@compiled
-def side_share(px: Any, py: Any, kx: Any, ky: Any, radius: Any, depth: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
-    """Share of a pixel that a cap hides by its base or by its side, which rays beside it meet from the air."""
-    kz = np.float32(math.sqrt(max(ONE - kx * kx - ky * ky, ZERO)))
-    across = np.float32(math.sqrt(HALF * (xu * xu + xv * xv + yu * yu + yv * yv)))  # metres a pixel
-    b = px * kx + py * ky + kz * depth
-    r2 = px * px + py * py
-    gx, gy = b * kx - px, b * ky - py
-    away = (b * b + radius * radius - r2) / (np.float32(2) * np.float32(math.sqrt(gx * gx + gy * gy)) + across)
-    if away < -across and r2 > (radius + across) * (radius + across):
-        return ZERO
-    if away > across and b < -across:
-        return ONE
-    total = ZERO
-    for i in range(SIDE):
-        t = (np.float32(i) + HALF) / np.float32(SIDE) - HALF
-        for j in range(SIDE):
-            s = (np.float32(j) + HALF) / np.float32(SIDE) - HALF
-            x, y = px + s * xu + t * xv, py + s * yu + t * yv
-            r2 = x * x + y * y
-            away = radius - np.float32(math.sqrt(r2))
-            b = x * kx + y * ky + kz * depth
-            if b < ZERO:
-                gx, gy = b * kx - x, b * ky - y
-                meets = b * b + radius * radius - r2
-                away = max(away, HALF * meets / max(np.float32(math.sqrt(gx * gx + gy * gy)), np.float32(1e-12)))
-            total += min(max(HALF + away / across * np.float32(SIDE), ZERO), ONE)
-    return total / np.float32(SIDE * SIDE)
-
-
-@inlined
-def share_of(tile: Any, t: Any, s: Any, room: Any, edge: Any, hangs: bool, cap: Any) -> Any:
-    """Share of a pixel that a cap hides. edge: room beyond which a pixel is surely inside, or, negative, outside."""
-    share = ONE
-    if not room > edge:
-        if not hangs and not room > -edge:
-            return ZERO
-        radius = np.float32(math.sqrt(cap[CAP_SQUARE]))
-        px, py = _value(tile, 0, t, s), _value(tile, 1, t, s)
-        xu, xv, yu, yv = _along(tile, 0, t, s), _down(tile, 0, t, s), _along(tile, 1, t, s), _down(tile, 1, t, s)
-        share = contact_share(px, py, radius, xu, xv, yu, yv) if room > -edge else ZERO
-        if hangs and share < ONE:
-            kx, ky, depth = _value(tile, 2, t, s), _value(tile, 3, t, s), np.float32(cap[CAP_DEPTH])
-            kz = np.float32(math.sqrt(max(ONE - kx * kx - ky * ky, ZERO)))
-            reach = abs(xu) + abs(xv) + abs(yu) + abs(yv)
-            if px * kx + py * ky + kz * depth < reach:
-                share = max(share, side_share(px, py, kx, ky, radius, depth, xu, xv, yu, yv))
-        if not share > ZERO:
-            return ZERO
-    return share
-
-
-@compiled
-def shares_of_row(
-    tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, hangs: bool, cap: Any,
-    line: Any, rays: Any,
-) -> None:  # fmt: skip
-    """Fill the plane `HIDDEN`: how much of each pixel of a row the cap hides."""
-    for j in range(np.uint64(lanes)):
-        room = rays[ROOM + j]
-        rays[HIDDEN + j] = ONE if room > edge else ZERO
-    if hangs:  # what the ray has to go yet to where it is closest to the sphere's centre; only before can it meet it
-        of_row(tile, t, line)
-        take_up(line, s, 0, (lanes + 7) // 8 * 8, rays)
-        depth = np.float32(cap[CAP_DEPTH])
-        for j in range(np.uint64(lanes)):
-            kx, ky = rays[KX + j], rays[KY + j]
-            kz = np.float32(math.sqrt(ONE - kx * kx - ky * ky))
-            rays[FREE + j] = rays[PX + j] * kx + rays[PY + j] * ky + kz * depth
-    near = np.float32(2) * wide
-    for j in range(np.uint64(lanes)):
-        room = rays[ROOM + j]
-        if not room > edge and (room > -edge or (hangs and rays[FREE + j] < near)):
-            rays[HIDDEN + j] = share_of(tile, t, s + np.float32(np.int32(j)), room, edge, hangs, cap)
-
-
-@inlined
-def _value(tile: Any, plane: Any, t: Any, s: Any) -> Any:
+@fused_part
+def value_on(tile: Any, plane: Any, t: Any, s: Any) -> Any:
+    """A tile's polynomial, t and s pixels from its own."""
     a = tile[plane, 0, 0] + t * (tile[plane, 1, 0] + t * tile[plane, 2, 0])
     b = tile[plane, 0, 1] + t * (tile[plane, 1, 1] + t * tile[plane, 2, 1])
     c = tile[plane, 0, 2] + t * (tile[plane, 1, 2] + t * tile[plane, 2, 2])
     return a + s * (b + s * c)
 
 
-@inlined
-def _along(tile: Any, plane: Any, t: Any, s: Any) -> Any:
+@fused_part
+def along(tile: Any, plane: Any, t: Any, s: Any) -> Any:
+    """How it changes a pixel along a row."""
     b = tile[plane, 0, 1] + t * (tile[plane, 1, 1] + t * tile[plane, 2, 1])
     c = tile[plane, 0, 2] + t * (tile[plane, 1, 2] + t * tile[plane, 2, 2])
     return b + (s + s) * c
 
 
-@inlined
-def _down(tile: Any, plane: Any, t: Any, s: Any) -> Any:
+@fused_part
+def down(tile: Any, plane: Any, t: Any, s: Any) -> Any:
+    """How it changes a pixel down."""
     b = tile[plane, 1, 0] + s * (tile[plane, 1, 1] + s * tile[plane, 1, 2])
     c = tile[plane, 2, 0] + s * (tile[plane, 2, 1] + s * tile[plane, 2, 2])
     return b + (t + t) * c
-
-
-@compiled
-def taken(
-    tile: Any, t: Any, s: Any, lanes: Any, wide: Any, caps: Any, number: Any, rivals: Any, outline: Any, line: Any,
-    rays: Any,
-) -> None:  # fmt: skip
-    """Give up the pixels of a row where another cap, that may hide some of them, has more room.
-
-    As in `drop_grid`, room is counted from the circle that a cap covers seen along the normal: its sphere's, if it
-    hangs over.
-    """
-    of_row(tile, t, line)
-    take_up(line, s, 0, (lanes + 7) // 8 * 8, rays)
-    x, y, alike = caps[number, CAP_X], caps[number, CAP_Y], np.float32(ALIKE * caps[number, CAP_SQUARE])
-    first, own = int(outline[OUT_RIVAL]), np.float32(min(caps[number, CAP_DEPTH], 0.0) ** 2)
-    for i in range(first, first + int(outline[OUT_RIVALS])):
-        other = rivals[i]
-        dx, dy = np.float32(caps[other, CAP_X] - x), np.float32(caps[other, CAP_Y] - y)
-        square, depth = np.float32(caps[other, CAP_SQUARE]), np.float32(caps[other, CAP_DEPTH])
-        need = own - np.float32(min(caps[other, CAP_DEPTH], 0.0) ** 2)
-        need += -alike if _comes_before(caps, other, number) else alike
-        edge = np.float32(1.45 * math.sqrt(caps[other, CAP_SQUARE]) * wide + wide * wide)
-        for j in range(np.uint64(lanes)):
-            px, py, kx, ky = rays[PX + j] - dx, rays[PY + j] - dy, rays[KX + j], rays[KY + j]
-            room = square - px * px - py * py
-            b = px * kx + py * ky + np.float32(math.sqrt(ONE - kx * kx - ky * ky)) * depth
-            by_side = b * b + room if b < ZERO else room
-            if room > rays[ROOM + j] + need and by_side > -edge:
-                rays[HIDDEN + j] = ZERO
-
-
-@inlined
-def _comes_before(caps: Any, one: Any, other: Any) -> Any:
-    """Which of two caps has what both have as much room for, whatever their order; of equal ones the first."""
-    before = one < other
-    for column in (CAP_Y, CAP_X, CAP_CURVATURE, CAP_SQUARE):
-        a, b = caps[one, column], caps[other, column]
-        before = a > b if a != b else before
-    return before
-
-
-# -- a pixel's own rays ------------------------------------------------------------------------------------------------
-
-
-@compiled
-def own_rays(
-    tile: Any, t: Any, s: Any, near: bool, cap: Any, later: Any, view: Any, side: Any, parts: Any,
-    rays: Any,
-) -> Any:  # fmt: skip
-    """side x side rays of one pixel to the planes `SUB`, and each one's part's share in the contact circle to `SHARE`.
-
-    near: whether the contact line may cross the pixel. parts: places on the pixel, see `rays_of_words`. Returns the
-    mean share.
-    """
-    radius = np.float32(math.sqrt(cap[CAP_SQUARE]))
-    px, py, kx, ky, dim = (_value(tile, 0, t, s), _value(tile, 1, t, s), _value(tile, 2, t, s), _value(tile, 3, t, s),
-                           _value(tile, 4, t, s))  # fmt: skip
-    xu, xv, yu, yv = _along(tile, 0, t, s), _down(tile, 0, t, s), _along(tile, 1, t, s), _down(tile, 1, t, s)
-    au, av, bu, bv = _along(tile, 2, t, s), _down(tile, 2, t, s), _along(tile, 3, t, s), _down(tile, 3, t, s)
-    part, count = ONE / np.float32(side), np.uint64(side * side)
-    for j in range(np.uint64((side * side + 7) // 8 * 8)):
-        x, y = parts[j], parts[np.uint64(64) + j]
-        rays[PX + j] = px + (x * xu + y * xv)
-        rays[PY + j] = py + (x * yu + y * yv)
-        rays[KX + j] = kx + (x * au + y * av)
-        rays[KY + j] = ky + (x * bu + y * bv)
-        rays[DIM + j] = dim
-        rays[SHARE + j] = ONE
-    total = np.float32(side * side)
-    if near:
-        total = ZERO
-        for k in range(count):
-            share = contact_share(
-                rays[PX + k], rays[PY + k], radius, xu * part, xv * part, yu * part, yv * part
-            )  # fmt: skip
-            rays[SHARE + k] = share
-            total += share
-    cross(cap, later, view, rays, 0, (side * side + 7) // 8 * 8, SUB)
-    return total * part * part

@@ -33,9 +33,13 @@ from .outlines import Outlines
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE, COARSE = (16, 4), (9, 3)
-"""Looks at what a pixel shows, and rays along the side of one at an edge."""
+FINE = (20.0, 8), (24.0, 12), (64.0, 24), (math.inf, 36)
+COARSE = (16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)
+"""Square root of the area, pixels, up to which what a pixel shows gets how many looks, the first of them at four boxes
+each."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
+WIDER = 1.4, 1.25, 1.25, 1.25
+"""Area of a box over that of its part of what a pixel shows: a little overlap is best."""
 LANES = 64
 FEW = 400  # caps, up to which all pairs are compared
 
@@ -124,29 +128,27 @@ class CapScene:
         """Of the images that hold the scene."""
         return Boxes.of(self.size)
 
-    @cached_property
-    def looks(self) -> tuple[Array, Indices]:
-        """Grids of looks, by how many are side by side; and how many looks each has, the first being their aim."""
-        aim = (COARSE if self.tolerance >= COARSE_FROM else FINE)[0]
-        most = aim // 2
-        grids: Array = np.zeros((most + 1, 5, LANES), dtype=np.float32)
-        counts = np.full(most + 1, aim, dtype=np.int64)
-        for across in range(1, most + 1):
-            down = min(max(aim // across, 2), most)
-            s, t = (part.ravel() for part in np.meshgrid(_middles(across), _middles(down)))
-            counts[across] = len(s)
-            grids[across, :, : len(s)] = s, t, s * s / 2, t * t / 2, s * t
-        return grids.ravel(), counts
+    @property
+    def fineness(self) -> tuple[tuple[float, int], ...]:
+        """`FINE` or `COARSE`."""
+        return COARSE if self.tolerance >= COARSE_FROM else FINE
 
     @cached_property
-    def parts(self) -> tuple[int, Array]:
-        """Parts along a pixel's side; places of them, and whether there is another right of and below each."""
-        side = (COARSE if self.tolerance >= COARSE_FROM else FINE)[1]
-        row, column = np.divmod(np.arange(side * side), side)
-        table: Array = np.zeros((4, LANES), dtype=np.float32)
-        middles = _middles(side)
-        table[:, : side * side] = middles[column], middles[row], column < side - 1, row < side - 1
-        return side, table.ravel()
+    def looks(self) -> tuple[Any, ...]:
+        """Grids of looks and what says which a patch gets, see `compiled.cap_frames.frame`."""
+        grids: list[Array] = []
+        counts: list[int] = []
+        bands: list[tuple[float, int, int, float]] = []
+        for (side, aim), wider in zip(self.fineness, WIDER, strict=True):
+            bands.append((min(side * side, FAR), aim, len(counts) - 2, wider / aim))
+            for across in range(2, aim // 2 + 1):
+                down = max(aim // across, 2)
+                s, t = (part.ravel() for part in np.meshgrid(_middles(across), _middles(down)))
+                counts.append(len(s))
+                grids.append(np.zeros((5, LANES), dtype=np.float32))
+                grids[-1][:, : len(s)] = s, t, s * s / 2, t * t / 2, s * t
+        table = np.array(bands, dtype=np.float32)
+        return np.concatenate(grids).ravel(), np.array(counts), int(bands[1][2] + 2), table
 
     def go(self, mode: int, out: Any, scene: Any, words: Any, caps: CapTable, record: Any) -> None:
         """Run the loops over caps, see `compiled.cap_frames.frame`."""
@@ -156,7 +158,7 @@ class CapScene:
         border = 0 if self.border == "mirror" else 1
         shift = np.float32(self.shift[0]), np.float32(self.shift[1])
         frame(
-            mode, out, scene, words, (boxes.start, boxes.width, boxes.inverse), border, shift, self.looks, *self.parts,
+            mode, out, scene, words, (boxes.start, boxes.width, boxes.inverse), border, shift, self.looks,
             caps.nodes, caps.columns, caps.outlines, caps.rivals, lattice.later, lattice.view, record,
         )  # fmt: skip
 
@@ -306,7 +308,7 @@ class CapTable:
     def _tabulated(self) -> _Tabulated:
         width, height = self.scene.camera.size
         out, image = (np.zeros((h, w, 0), dtype=np.uint8) for w, h in ((width, height), self.scene.size))
-        words = np.zeros(self.scene.boxes.count, dtype=np.uint64)
+        words = np.zeros(self.scene.boxes.count, dtype=np.uint32)
         record = _record(0, 0)
         self.scene.go(COUNT, out, image, words, self, record)
         pixels, taps = record[-1].tolist()

@@ -88,7 +88,7 @@ class Renderer:
     linear_light: whether values are sRGB and light is to be averaged, not values.
     moving: whether most drops move from frame to frame: caps on far faces are then traced as they are drawn, by loops
     in machine code (`moving_caps`; needs numba, `rainstereo.compiled`), so that a plan costs next to nothing, and
-    pixels in drops are off by 2 gray levels or so, at tolerances from 2.5 on by some more, in less time. Without numba,
+    pixels in drops are off by 1 gray level or so, at tolerances from 2.5 on by 2, in less time. Without numba,
     with lenses that only mrcal knows, and for other shapes, drops are planned with a few looks a pixel (`single_ray`):
     in some four times as long, and off by 4. Drops under gravity are drawn as caps of their volume where the bound of
     what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).

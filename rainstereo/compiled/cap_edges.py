@@ -1,0 +1,296 @@
+"""Pixels that only some light reaches, or several caps show: each has 16 rays of its own, which look at one box each.
+
+How large a box is follows from how far from the drop the ray looks: as many times as far as it is from the drop's
+middle are also rays apart that pass the middle as far away. Towards the middle, where the cap turns dark, what a ray
+shows is drawn out. With angles r and f of the ray behind the surface and of the normal to the axis, that is by
+(cot r' / cot r - 1) tan f / (sin (r - f) cos (r - f)), r' the angle before: close to twice the first factor. So there
+are more rays towards the middle than across.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from .boxes import FIELD, FIRST, TWICE
+from .cap_looks import BIAS, ONE_, SMALLEST, TWO_, folded, pixel_value
+from .cap_rays import (
+    CAP_CURVATURE,
+    CAP_DEPTH,
+    CAP_INDEX,
+    CAP_SQUARE,
+    DIM,
+    GAIN,
+    HALF,
+    HELD,
+    HIDDEN,
+    KX,
+    KY,
+    ONE,
+    PER,
+    PX,
+    PY,
+    RIVAL,
+    ROOM,
+    SHARE,
+    SHOWN,
+    SPREAD,
+    STRETCH,
+    SUB,
+    WEIGHT,
+    Y_,
+    ZERO,
+    cross,
+)
+from .cap_shares import contact_share, from_rival
+from .cap_tiles import LITS
+from .compile import fused, fused_part
+from .prefetch import to_read
+
+RAYS, LANES = 16, np.uint64(16)
+TOGETHER, HOLDS = 4, 112  # pixels whose rays are traced at once, and, at most, of a row: two where caps meet
+FORMS = ((8, 2), (2, 8), (4, 4))
+"""Rays along and down a pixel: towards the middle of a cap beside it, above or below it, and in other directions."""
+STEEP = 1.73  # tan of the angle from which it is beside, or above
+WIDER = np.float32(1.8)
+"""Area of a box over that of the part of a patch that a ray stands for."""
+SOFTEST = np.float32(1e-3)  # less is lost in rounding
+SIZE_BITS, NO_BOX = 27, 31
+"""From which bit on a box's number holds its size; and the size that is the image itself."""
+
+
+@fused_part
+def slopes_of_row(tile: Any, t: Any, slopes: Any) -> None:
+    """How the polynomials of a row, t pixels from that which a tile's are about, change a pixel down; as `of_row`."""
+    for plane in range(4):
+        for power in range(3):
+            slopes[3 * plane + power] = tile[plane, 1, power] + (t + t) * tile[plane, 2, power]
+
+
+@fused_part
+def has_own(rays: Any, lane: Any, tiny: bool) -> Any:
+    """Whether a pixel, between lanes that have been traced, has rays of its own."""
+    j = np.uint64(lane)
+    return rays[HIDDEN + j] > ZERO and (tiny or rays[LITS + j] == ONE or rays[RIVAL + j] > ZERO)
+
+
+@fused_part
+def form_of(u: Any, v: Any, outline: Any, tiny: bool, rival: Any) -> Any:
+    """Which of `FORMS` a pixel at u, v has: the last, too, if it is a tiny cap's or other caps are there."""
+    dx, dy = abs(u - outline[0]), abs(v - outline[1])
+    if tiny or rival >= 0:
+        return 2
+    return 0 if dx > STEEP * dy else 1 if dy > STEEP * dx else 2
+
+
+@fused_part
+def _at(line: Any, plane: int, s: Any) -> Any:
+    """A polynomial of a row, s pixels along."""
+    return line[3 * plane] + s * (line[3 * plane + 1] + s * line[3 * plane + 2])
+
+
+@fused_part
+def _along(line: Any, plane: int, s: Any) -> Any:
+    """How it changes a pixel along."""
+    return line[3 * plane + 1] + (s + s) * line[3 * plane + 2]
+
+
+@fused
+def set_out(
+    s: Any, u: Any, v: Any, near: bool, form: Any, which: Any, caps: Any, number: Any, rival: Any, outlines: Any,
+    line: Any, slopes: Any, rays: Any, first: Any,
+) -> Any:  # fmt: skip
+    """Take up the rays of one pixel, lanes from `first` on, with the share of the pixel that each stands for. Returns
+    how much of the pixel the cap hides.
+
+    s: pixels from the tile's own along a row; line, slopes: of the row. u, v: in the image. near: whether the contact
+    line may cross the pixel, or other caps are there. which: the cap that the rays go through, `number` or `rival`
+    (-1: none); each has the parts of the pixel where it has more room than the other.
+    """
+    bits = np.int32(3) if form == 0 else np.int32(1) if form == 1 else np.int32(2)  # of a ray's number: along a row
+    mask = np.int32((1 << bits) - 1)
+    width, part = ONE / np.float32(1 << bits), np.float32(1 / RAYS)
+    height, own = part / width, which == number
+    px, py, kx, ky, dim = _at(line, 0, s), _at(line, 1, s), _at(line, 2, s), _at(line, 3, s), _at(line, 4, s)
+    xu, yu, au, bu = _along(line, 0, s), _along(line, 1, s), _along(line, 2, s), _along(line, 3, s)
+    xv, yv, av, bv = _at(slopes, 0, s), _at(slopes, 1, s), _at(slopes, 2, s), _at(slopes, 3, s)
+    dx, dy, need = ZERO, ZERO, ZERO
+    if rival >= 0:
+        dx, dy, need = from_rival(caps, number, rival)
+    x0, y0 = (px, py) if own else (px - dx, py - dy)
+    cap = caps[which]
+    soft = softness(cap, x0, y0, kx, ky, xu * width, xv * height, yu * width, yv * height)
+    soft = soft if soft > SOFTEST else SOFTEST
+    far_x, far_y = np.float32(u - outlines[which, 0]), np.float32(v - outlines[which, 1])
+    per, start_x, start_y = far_x * far_x + far_y * far_y, HALF * width - HALF, HALF * height - HALF
+    per = WIDER * SMALLEST * part / (per if per > ONE else ONE)
+    for j in range(LANES):
+        i, k = first + j, np.int32(j)
+        x, y = np.float32(k & mask) * width + start_x, np.float32(k >> bits) * height + start_y
+        rays[PX + i] = x0 + (x * xu + y * xv)
+        rays[PY + i] = y0 + (x * yu + y * yv)
+        rays[KX + i] = kx + (x * au + y * av)
+        rays[KY + i] = ky + (x * bu + y * bv)
+        rays[DIM + i] = dim
+        rays[SHARE + i] = part
+        rays[SPREAD + i] = soft
+        rays[PER + i] = per
+    if not near:
+        return ONE
+    if rival >= 0:
+        square, other = np.float32(caps[number, CAP_SQUARE]), np.float32(caps[rival, CAP_SQUARE])
+        back_x, back_y = (ZERO, ZERO) if own else (dx, dy)
+        for i in range(first, first + LANES):
+            x, y = rays[PX + i] + back_x, rays[PY + i] + back_y
+            gx, gy = x - dx, y - dy
+            more = (other - gx * gx - gy * gy) - ((square - x * x - y * y) + need)
+            rays[SHARE + i] = part if (more > ZERO) != own else ZERO
+    radius, total = np.float32(math.sqrt(cap[CAP_SQUARE])), ZERO
+    for i in range(first, first + LANES):
+        share = contact_share(rays[PX + i], rays[PY + i], radius, xu * width, xv * height, yu * width, yv * height)
+        rays[SHARE + i] *= share if share > ZERO else ZERO
+    for i in range(first, first + LANES):
+        total += rays[SHARE + i]
+    return total
+
+
+@fused
+def trace_own(cap: Any, later: Any, view: Any, rays: Any, lanes: Any) -> None:
+    """Rays that were set out, from lane 0 to before `lanes`, to the planes `SUB`; and to `WEIGHT` the gain of each
+    times the share of the pixel that it stands for."""
+    cross(cap, later, view, rays, 0, lanes, SUB, True)
+    for j in range(np.uint64(lanes)):
+        rays[WEIGHT + j] = rays[SUB + GAIN + j] * rays[SHARE + j]
+
+
+@fused_part
+def softness(cap: Any, px: Any, py: Any, kx: Any, ky: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
+    """Half of how much the square of the wave vector's component along a cap's normal changes over a pixel's part."""
+    q, curvature, depth = np.float32(cap[CAP_INDEX] ** 2), np.float32(cap[CAP_CURVATURE]), np.float32(cap[CAP_DEPTH])
+    b = np.float32(math.sqrt(q - kx * kx - ky * ky)) * depth + px * kx + py * ky
+    gu, gv = b * (kx * xu + ky * yu) - q * (px * xu + py * yu), b * (kx * xv + ky * yv) - q * (px * xv + py * yv)
+    return curvature * curvature * np.float32(math.sqrt(gu * gu + gv * gv))
+
+
+@fused
+def boxes_of_rays(
+    outline: Any, last: Any, shift: Any, border: Any, sizes: Any, rays: Any, lanes: Any, at: Any
+) -> None:  # fmt: skip
+    """The boxes that rays look at, lanes up to before `lanes`: each one's number among those of its size, and, from bit
+    `SIZE_BITS` on, the size, to `at`, uint32; and the places of rays in the scene, brought into it, to `SUB`.
+
+    outline: of the cap. sizes: of boxes that there are.
+    """
+    middle_x, middle_y = np.float32(outline[0]) + shift[0], np.float32(outline[1]) + shift[1]
+    two = np.float32(2)
+    most, wide = np.int32(sizes - 1), np.int32(last[0])
+    one, zero, exponent = np.int32(1), np.int32(0), np.int32(127)
+    for j in range(np.uint64(lanes)):
+        x, y = rays[SUB + j] + shift[0], rays[SUB + Y_ + j] + shift[1]
+        x, y = (x, y) if rays[WEIGHT + j] > ZERO else (ZERO, ZERO)
+        gx, gy = x - middle_x, y - middle_y
+        longer = rays[STRETCH + j] + rays[STRETCH + j] - two
+        longer = longer if longer > ONE else ONE
+        size = (np.float32((gx * gx + gy * gy) * rays[PER + j] * longer).view(np.int32) >> np.int32(23)) - exponent
+        none = size < -one
+        size = size if size > zero else zero
+        size = size if size < most else most
+        coarser = (size - np.int32(3)) >> one  # pixels between boxes: `rain.boxes`
+        bits = (coarser if coarser > zero else zero) + one
+        inverse = np.int32((exponent - bits) << np.int32(23)).view(np.float32)
+        pitch = (wide >> bits) + np.int32(2)
+        x, y = folded(x, last[0], border), folded(y, last[1], border)
+        rays[SUB + j] = x
+        rays[SUB + Y_ + j] = y
+        middle = HALF * inverse + HALF
+        box = np.int32(y * inverse + middle) * pitch + np.int32(x * inverse + middle)
+        at[j] = np.uint32(box) + (np.uint32(NO_BOX if none else size) << np.uint32(SIZE_BITS))
+
+
+@fused_part
+def hold(words: Any, scene: Any, starts: Any, rays: Any, at: Any, first: Any, to: Any, lane: Any) -> None:
+    """Call for the boxes of a pixel's rays, lanes from `first` on, and keep their numbers and weights from `to` on;
+    what rays show that look at the image itself is added at once to what the pixel of a lane shows."""
+    for j in range(LANES):
+        box = np.uint64(at[first + j])
+        size = box >> np.uint64(SIZE_BITS)
+        weight = rays[WEIGHT + first + j]
+        if size == np.uint64(NO_BOX):
+            for channel in range(scene.shape[2]):
+                part = pixel_value(scene, rays[SUB + first + j], rays[SUB + Y_ + first + j], channel)
+                rays[SHOWN + lane + lane + lane + np.uint64(channel)] += weight * part
+            at[np.uint64(64) + to + j] = np.uint32(0)
+            rays[HELD + to + j] = ZERO
+        else:
+            box = np.uint64(starts[size]) + (box & np.uint64((1 << SIZE_BITS) - 1))
+            to_read(words, box)
+            at[np.uint64(64) + to + j] = np.uint32(box)
+            rays[HELD + to + j] = weight
+
+
+@fused_part
+def show_held(words: Any, rays: Any, at: Any, first: Any, lane: Any) -> None:
+    """Add what the boxes hold that were called for to what a lane shows."""
+    red, green, blue, boxed = ZERO, ZERO, ZERO, ZERO
+    for j in range(first, first + LANES):
+        weight, word = rays[HELD + j], words[np.uint64(at[np.uint64(64) + j])]
+        boxed += weight
+        red += weight * np.float32(np.int32(word & FIRST))
+        green += weight * np.float32(np.int32((word >> FIELD) & FIRST))
+        blue += weight * np.float32(np.int32(word >> TWICE))
+    k, boxed = SHOWN + lane + lane + lane, boxed * BIAS
+    rays[k] += red - boxed
+    rays[k + ONE_] += green - boxed
+    rays[k + TWO_] += blue - boxed
+
+
+@fused
+def edges_of_words(
+    words: Any, scene: Any, starts: Any, last: Any, shift: Any, border: Any, s: Any, u: Any, v: Any, edge: Any,
+    hangs: bool, tiny: bool, caps: Any, number: Any, outlines: Any, later: Any, view: Any, low: Any, high: Any,
+    line: Any, slopes: Any, rays: Any, at: Any, slots: Any,
+) -> None:  # fmt: skip
+    """Add what those pixels of a row show that have rays of their own to `SHOWN`; and what caps hide of them.
+
+    Up to four pixels' rays are traced at once. u, v: column of lane 0, and row. line, slopes: of the row. at: (64 +
+    16 HOLDS,) uint32; slots: (HOLDS,) int64.
+    """
+    held, made = 0, 0  # pixels whose boxes have been called for, and others whose rays are set out
+    for lane in range(low, high + 1):
+        j, owns = np.uint64(lane), lane < high and has_own(rays, lane, tiny)
+        rival = np.int64(rays[RIVAL + j]) - 1 if owns else -1
+        if made > 0 and (made == TOGETHER or rival >= 0 or lane == high):
+            trace_own(caps[number], later, view, rays, made * RAYS)
+            boxes_of_rays(outlines[number], last, shift, border, len(starts), rays, made * RAYS, at)
+            for i in range(np.uint64(made)):
+                pixel = np.uint64(slots[np.uint64(held) + i])
+                hold(words, scene, starts, rays, at, LANES * i, LANES * (np.uint64(held) + i), pixel)
+            held, made = held + made, 0
+        if not owns:
+            continue
+        form, at_s = form_of(u + lane, v, outlines[number], tiny, rival), s + np.float32(lane)
+        if rival < 0:
+            near = not rays[ROOM + j] > edge
+            hidden = set_out(
+                at_s, u + lane, v, near, form, number, caps, number, rival, outlines, line, slopes, rays,
+                LANES * np.uint64(made),
+            )  # fmt: skip
+            slots[np.uint64(held + made)] = lane
+            made += 1
+        else:
+            hidden = ZERO
+            for which in (number, rival):
+                hidden += set_out(
+                    at_s, u + lane, v, True, form, which, caps, number, rival, outlines, line, slopes, rays,
+                    np.uint64(0),
+                )  # fmt: skip
+                trace_own(caps[which], later, view, rays, RAYS)
+                boxes_of_rays(outlines[which], last, shift, border, len(starts), rays, RAYS, at)
+                hold(words, scene, starts, rays, at, np.uint64(0), LANES * np.uint64(held), j)
+                slots[np.uint64(held)] = lane
+                held += 1
+        rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
+    for i in range(np.uint64(held)):
+        show_held(words, rays, at, LANES * i, np.uint64(slots[i]))
