@@ -9,16 +9,12 @@ import numpy as np
 from .compile import compiled
 from .eights import four_channels, one_channel, three_channels, two_channels
 from .layout import LANES
-from .prefetch import to_read, to_write
+from .prefetch import to_write
 
 U = np.uint64
 EIGHT = U(LANES)
-LINE, LINES = U(4), U(1023)
-"""A cache line holds 2^4 quads. So many lines, less one, are taken to be at hand, each at a place of its own."""
-SOON = U(3)
-"""Groups of eight rows that lines are fetched before: what rows look at is not always where those before looked."""
-LATER = U(4)
-"""The same of pixels that will be written: they lie anywhere in the image."""
+SOON = U(4)
+"""Groups of eight pixels that are fetched before they are written: they lie anywhere in the image."""
 
 
 @compiled
@@ -56,53 +52,21 @@ def interleave(
 
 
 @compiled
-def lines(taps: Any, most: Any, bits: int, counts: Any, places: Any) -> Any:
-    """Find quads that are not at hand since others of their cache line were looked at; returns how many.
-
-    taps, most, bits: of `interleave`. counts: (ceil(M / 8),) of each eight rows. places: (n,) of the quads, as far as
-    there is room.
-    """
-    known = np.full(LINES + U(1), -1, np.int64)
-    mask, first, found = (np.int64(1) << bits) - np.int64(1), U(0), U(0)
-    for eight in range(U(len(most))):
-        before = found
-        for tap in range(first, first + U(most[eight]) * EIGHT):
-            place = U(np.int64(taps[tap]) & mask)
-            line = place >> LINE
-            if known[line & LINES] != np.int64(line):
-                known[line & LINES] = np.int64(line)
-                if found < U(len(places)):
-                    places[found] = place
-                found += U(1)
-        counts[eight] = found - before
-        first += U(most[eight]) * EIGHT
-    return found
-
-
-@compiled
 def sum_quads(
-    out: Any, channels: int, quads: Any, shift: int, pixels: Any, most: Any, taps: Any, counts: Any, places: Any,
-    roundings: Any,
+    out: Any, channels: int, quads: Any, shift: int, pixels: Any, most: Any, taps: Any, roundings: Any
 ) -> None:  # fmt: skip
     """Write pixels: sums of bytes times weights.
 
     out: (P * channels,) uint8, of one to four channels. quads: (N,) uint32. shift: bits of a weight's unit. pixels:
-    (M,) uint32, M a multiple of 8. most, taps, counts, places: of `interleave` and `lines`. roundings: (M,) int32,
-    units of weights, for every channel.
+    (M,) uint32, M a multiple of 8. most, taps: of `interleave`. roundings: (M,) int32, units of weights, for every
+    channel.
     """
-    unit, apart, end, last = np.uint32(shift), U(channels), U(len(pixels)) - U(1), U(len(most))
-    tap, line = U(0), U(0)
-    for eight in range(min(SOON, last)):
-        line += U(counts[eight])
-    for eight in range(last):
+    unit, apart, end, tap = np.uint32(shift), U(channels), U(len(pixels)) - U(1), U(0)
+    for eight in range(U(len(most))):
         row, first = eight * EIGHT, tap
         tap += U(most[eight]) * EIGHT
         for lane in range(EIGHT):
-            to_write(out, U(pixels[min(row + LATER * EIGHT + lane, end)]) * apart)
-        if eight + SOON < last:
-            for each in range(line, line + U(counts[eight + SOON])):
-                to_read(quads, U(places[each]))
-            line += U(counts[eight + SOON])
+            to_write(out, U(pixels[min(row + SOON * EIGHT + lane, end)]) * apart)
         if channels == 1:
             one_channel(out, quads, unit, pixels, row, taps, first, tap, roundings)
         elif channels == 2:

@@ -65,8 +65,6 @@ class Eights:
     pixels: Any
     most: Any
     taps: Any
-    counts: Any
-    places: Any
     roundings: Any
 
 
@@ -113,10 +111,7 @@ class Paste:
         self._needed.put_quads(levels, row[:end])
         pack_some(below, self.soft, row[end:])
         for some in self._eights:
-            sum_quads(
-                out.reshape(-1), out.shape[1], row, SHIFT, some.pixels, some.most, some.taps, some.counts, some.places,
-                some.roundings,
-            )  # fmt: skip
+            sum_quads(out.reshape(-1), out.shape[1], row, SHIFT, some.pixels, some.most, some.taps, some.roundings)
         self._spare.append(row)
 
     def _words(self, levels: list[Image], below: Image, out: Image, part: slice) -> None:
@@ -195,7 +190,7 @@ class Paste:
         return [self._in_eights(piece) for piece in self._wholes]
 
     def _in_eights(self, piece: Piece) -> Eights:
-        from rainstereo.compiled.sums import interleave, lines
+        from rainstereo.compiled.sums import interleave
 
         table, counts, clear = piece.table, piece.table.counts[piece.rows], self._clear[piece.number][piece.rows]
         most = np.maximum.reduceat(np.maximum(counts + (clear > 0), 1), np.arange(0, len(counts), LANES))
@@ -206,13 +201,10 @@ class Paste:
         interleave(
             counts, self._places, table.texels[piece.taps], table.weights[piece.taps], clear, below, bits, most, taps
         )
-        of_lines: Any = np.empty(len(most), dtype=np.uint32)
-        places: Any = np.empty(lines(taps, most, bits, of_lines, np.empty(0, dtype=np.uint32)), dtype=np.uint32)
-        lines(taps, most, bits, of_lines, places)
         rest = (0, -len(counts) % LANES)
         pixels = np.pad(table.pixels[piece.rows].view(np.uint32), rest, mode="edge")
         roundings = self._roundings[piece.number][piece.rows].astype(np.int32) - (BELOW << SHIFT)
-        return Eights(pixels, most.astype(np.uint32), taps, of_lines, places, np.pad(roundings, rest, mode="edge"))
+        return Eights(pixels, most.astype(np.uint32), taps, np.pad(roundings, rest, mode="edge"))
 
     @cached_property
     def _of_tap(self) -> tuple[type, int]:
