@@ -153,7 +153,7 @@ def test_loops_compiled_ahead_are_those_that_draw(lasting, monkeypatch):
     from rainstereo.compiled import orders, pursuit, quads, sums, windows
 
     loops = [pursuit.choose] if lasting else []
-    loops += [orders.reorder, sums.interleave, sums.lines, sums.sum_quads, windows.places]
+    loops += [orders.reorder, sums.interleave, sums.sum_quads, windows.places]
     loops += [quads.pack, quads.pack_some, quads.average]
     renderer = Renderer(Camera.pinhole(400, 400, 101, 75, *SIZE), PANE, lasting=lasting)
     compile_ahead.cache_clear()
