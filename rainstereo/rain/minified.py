@@ -121,7 +121,7 @@ class Minifier:
             compile_ahead(self.lasting)
         for table in self._one_by_one(batches):
             every += len(table.texels)
-            if size + table.size > JOINED:  # before the next ones come: the memory of these serves them
+            if size + table.size > self._joined:  # before the next ones come: the memory of these serves them
                 tables += self._ordered(small)
                 size = 0
                 if every > LARGE:
@@ -151,7 +151,12 @@ class Minifier:
             wide.clear()
 
     def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
-        return [table.ordered(self.camera.width) for table in Lookups.joined(tables)]
+        return [table.ordered(self.camera.width) for table in Lookups.joined(tables, self._joined)]
+
+    @property
+    def _joined(self) -> int:
+        """Size up to which tables are joined: the larger, the more rows of as many taps look at the same tile."""
+        return 2 * JOINED if self.lasting else JOINED
 
     def _one_by_one(self, batches: Sequence[Batch]) -> Iterator[Lookups]:
         """Tables of a few thousand pixels each; none is empty."""
