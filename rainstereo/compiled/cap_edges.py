@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from .boxes import FIELD, FIRST, TWICE
 from .cap_looks import BIAS, ONE_, SMALLEST, TWO_, folded, pixel_value
 from .cap_rays import (
     CAP_CURVATURE,
@@ -28,6 +27,7 @@ from .cap_rays import (
     HIDDEN,
     KX,
     KY,
+    MARK,
     ONE,
     PER,
     PX,
@@ -46,6 +46,7 @@ from .cap_rays import (
 )
 from .cap_shares import contact_share, from_rival
 from .cap_tiles import LITS
+from .cap_vectors import above_zero, lanes_from, lowest, sum_of_16, weighed
 from .compile import fused, fused_part
 from .prefetch import to_read
 
@@ -97,7 +98,7 @@ def _along(line: Any, plane: int, s: Any) -> Any:
     return line[3 * plane + 1] + (s + s) * line[3 * plane + 2]
 
 
-@fused
+@fused_part
 def set_out(
     s: Any, u: Any, v: Any, near: bool, form: Any, which: Any, caps: Any, number: Any, rival: Any, outlines: Any,
     line: Any, slopes: Any, rays: Any, first: Any,
@@ -147,13 +148,11 @@ def set_out(
             gx, gy = x - dx, y - dy
             more = (other - gx * gx - gy * gy) - ((square - x * x - y * y) + need)
             rays[SHARE + i] = part if (more > ZERO) != own else ZERO
-    radius, total = np.float32(math.sqrt(cap[CAP_SQUARE])), ZERO
+    radius = np.float32(math.sqrt(cap[CAP_SQUARE]))
     for i in range(first, first + LANES):
         share = contact_share(rays[PX + i], rays[PY + i], radius, xu * width, xv * height, yu * width, yv * height)
         rays[SHARE + i] *= share if share > ZERO else ZERO
-    for i in range(first, first + LANES):
-        total += rays[SHARE + i]
-    return total
+    return sum_of_16(rays, SHARE + first)
 
 
 @fused
@@ -233,20 +232,14 @@ def hold(words: Any, scene: Any, starts: Any, rays: Any, at: Any, first: Any, to
 @fused_part
 def show_held(words: Any, rays: Any, at: Any, first: Any, lane: Any) -> None:
     """Add what the boxes hold that were called for to what a lane shows."""
-    red, green, blue, boxed = ZERO, ZERO, ZERO, ZERO
-    for j in range(first, first + LANES):
-        weight, word = rays[HELD + j], words[np.uint64(at[np.uint64(64) + j])]
-        boxed += weight
-        red += weight * np.float32(np.int32(word & FIRST))
-        green += weight * np.float32(np.int32((word >> FIELD) & FIRST))
-        blue += weight * np.float32(np.int32(word >> TWICE))
+    red, green, blue, boxed = weighed(words, at, np.uint64(64) + first, rays, HELD + first)
     k, boxed = SHOWN + lane + lane + lane, boxed * BIAS
     rays[k] += red - boxed
     rays[k + ONE_] += green - boxed
     rays[k + TWO_] += blue - boxed
 
 
-@fused
+@fused_part
 def edges_of_words(
     words: Any, scene: Any, starts: Any, last: Any, shift: Any, border: Any, s: Any, u: Any, v: Any, edge: Any,
     hangs: bool, tiny: bool, caps: Any, number: Any, outlines: Any, later: Any, view: Any, low: Any, high: Any,
@@ -258,10 +251,16 @@ def edges_of_words(
     16 HOLDS,) uint32; slots: (HOLDS,) int64.
     """
     held, made = 0, 0  # pixels whose boxes have been called for, and others whose rays are set out
-    for lane in range(low, high + 1):
-        j, owns = np.uint64(lane), lane < high and has_own(rays, lane, tiny)
+    for each in range(np.uint64(64)):
+        others = rays[HIDDEN + each] if rays[RIVAL + each] > ZERO else ZERO
+        rays[MARK + each] = rays[HIDDEN + each] if tiny or rays[LITS + each] == ONE else others
+    left = lanes_from(above_zero(rays, MARK), low, high)
+    while left or made > 0:
+        j = lowest(left) if left else np.uint64(0)
+        lane, owns = np.int64(j), left > np.uint64(0)
+        left &= left - ONE_
         rival = np.int64(rays[RIVAL + j]) - 1 if owns else -1
-        if made > 0 and (made == TOGETHER or rival >= 0 or lane == high):
+        if made > 0 and (made == TOGETHER or rival >= 0 or not owns):
             trace_own(caps[number], later, view, rays, made * RAYS)
             boxes_of_rays(outlines[number], last, shift, border, len(starts), rays, made * RAYS, at)
             for i in range(np.uint64(made)):

@@ -19,7 +19,7 @@ from .cap_edges import (
     trace_own,
 )
 from .cap_looks import ROUND, is_whole, whole_of_words
-from .cap_rays import CAP_SQUARE, CLEAR, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
+from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
 from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
 from .cap_tiles import (
@@ -42,10 +42,13 @@ from .cap_tiles import (
     row_of_tile,
     widest,
 )  # fmt: skip
-from .compile import fused
+from .cap_vectors import thrice
+from .compile import fused, fused_part
 from .layout import DRAW, FILL
+from .prefetch import to_write
 
 WHITE = np.float32(255)
+EIGHT = np.uint64(8)
 
 
 @fused
@@ -92,6 +95,7 @@ def frame(
                 following = next_span(tile, np.float32(v1) - v0, s, lanes, cap, edge, line, rays)
                 for v in range(v1, v2):
                     low, high = following
+                    call_for(out, v + 2, v2, u1, lanes)
                     t = np.float32(v) - v0
                     move_up(rays)
                     following = (0, 0)
@@ -105,9 +109,9 @@ def frame(
                     )  # fmt: skip
                     known = low < high
                     patches(rays, begin, end, bands, shift, last)
-                    shares_of_row(tile, t, s, lanes, edge, wide, hangs, cap, line, rays)
+                    shares_of_row(tile, t, s, lanes, low, high, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
-                        taken(tile, t, s, lanes, wide, caps, number, rivals, outline, line, rays)
+                        taken(tile, t, s, u1, v, lanes, wide, caps, number, rivals, outlines, line, rays)
                     of_row(tile, t, line)
                     slopes_of_row(tile, t, slopes)
                     if mode != DRAW:
@@ -185,24 +189,31 @@ def record_row(
         cursor[PIXELS] += 1
 
 
-@fused
+@fused_part
+def call_for(out: Any, v: Any, stop: Any, u: Any, lanes: Any) -> None:
+    """Have a row's pixels, before `stop`, brought from memory."""
+    if v < stop:
+        every, channels, line = out.ravel(), np.uint64(out.shape[2]), np.uint64(64)
+        first = (np.uint64(v) * np.uint64(out.shape[1]) + np.uint64(u)) * channels
+        for k in range(first, first + np.uint64(lanes) * channels, line):
+            to_write(every, k)
+
+
+@fused_part
 def write_bytes(out: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
     """Mix what a row shows with what is there, where a cap hides it."""
     channels, three, block = np.uint64(out.shape[2]), np.uint64(3), np.uint64(32)
     row, first = out[v].ravel(), np.uint64(u) * channels
-    for j in range(np.uint64(64)):
-        for channel in range(three):
-            rays[CLEAR + three * j + channel] = ONE - rays[HIDDEN + j]
     if channels == three:
-        count = (
-            (three * np.uint64(lanes) + block - np.uint64(1)) // block * block
-        )  # whole vectors: beyond, all is clear
+        count = (three * np.uint64(lanes) + block - np.uint64(1)) // block * block  # whole vectors
+        for j in range(np.uint64(0), (count + three - np.uint64(1)) // three, EIGHT):  # beyond the lanes, all is clear
+            thrice(rays, HIDDEN + j, COVER + three * j)
         for k in range(min(count, np.uint64(len(row)) - first)):
-            value = rays[SHOWN + k] + rays[CLEAR + k] * np.float32(row[first + k]) + HALF
+            value = rays[SHOWN + k] + (ONE - rays[COVER + k]) * np.float32(row[first + k]) + HALF
             row[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))
         return
     for j in range(np.uint64(lanes)):
         for channel in range(channels):
             k, at = three * j + channel, first + j * channels + channel
-            value = rays[SHOWN + k] + rays[CLEAR + k] * np.float32(row[at]) + HALF
+            value = rays[SHOWN + k] + (ONE - rays[HIDDEN + j]) * np.float32(row[at]) + HALF
             row[at] = np.uint8(np.int32(value if value < WHITE else WHITE))

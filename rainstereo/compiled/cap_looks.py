@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .boxes import channels_of, spread
-from .cap_rays import FOUR, HALF, HIDDEN, ONE, RIVAL, SHOWN, ZERO
+from .cap_rays import FOUR, HALF, HIDDEN, MARK, ONE, RIVAL, SHOWN, ZERO
 from .cap_tiles import (
     ABX,
     ABY,
@@ -34,6 +34,7 @@ from .cap_tiles import (
     PART,
     WHOLE,
 )  # fmt: skip
+from .cap_vectors import above_zero, lanes_from, lowest, sum_of_words
 from .compile import fused, fused_part
 from .prefetch import to_read
 
@@ -153,20 +154,6 @@ def places(
 
 
 @fused_part
-def sum_of(words: Any, at: Any, first: Any, count: Any) -> Any:
-    """Of some boxes."""
-    found, stop = np.uint64(0), first + np.uint64(count)
-    fours = first + np.uint64(count // 4 * 4)
-    for k in range(first, fours, FOUR_):
-        a, b = words[np.uint64(at[k])], words[np.uint64(at[k + ONE_])]
-        c, d = words[np.uint64(at[k + TWO_])], words[np.uint64(at[k + TWO_ + ONE_])]
-        found += spread((a + b) + (c + d))
-    for k in range(fours, stop):
-        found += spread(words[np.uint64(at[k])])
-    return found
-
-
-@fused_part
 def sum_of_means(words: Any, pitch: Any, at: Any, parts: Any, first: Any, count: Any) -> Any:
     """Of bilinear means of four boxes each, 16 times as large."""
     found, line = np.uint64(0), np.uint64(pitch)
@@ -195,7 +182,7 @@ def is_whole(rays: Any, j: Any) -> Any:
     return rays[HIDDEN + j] > ZERO and rays[LITS + j] == WHOLE and not rays[RIVAL + j] > ZERO
 
 
-@fused
+@fused_part
 def whole_of_words(
     words: Any, scene: Any, starts: Any, pitches: Any, inverses: Any, last: Any, border: Any,
     grids: Any, counts: Any, fines: Any, low: Any, high: Any, rays: Any, total: Any, at: Any, parts: Any, slots: Any,
@@ -205,14 +192,15 @@ def whole_of_words(
     counts: looks of each grid; the first `fines` of them are of means of four boxes. at, parts, slots: (ROUND * 64,)
     uint32 twice, and (3, ROUND) int64.
     """
-    lane = low
-    while lane < high:
+    for each in range(np.uint64(64)):
+        shown = rays[HIDDEN + each] if rays[LITS + each] == WHOLE else ZERO
+        rays[MARK + each] = ZERO if rays[RIVAL + each] > ZERO else shown
+    left = lanes_from(above_zero(rays, MARK), low, high)
+    while left:
         made = 0
-        while lane < high and made < ROUND:
-            j = np.uint64(lane)
-            lane += 1
-            if not is_whole(rays, j):
-                continue
+        while left and made < ROUND:
+            j = lowest(left)
+            left &= left - ONE_
             grid, k = np.int64(rays[GRID + j]), size_of(rays[PART + j], len(inverses))
             if k < 0:
                 total[:] = ZERO
@@ -245,7 +233,7 @@ def whole_of_words(
                     places(False, start, pitch, one, last, on, rays, j, grids, of_grid, count, at, first, parts)
                 for look in range(first, first + np.uint64(count)):
                     to_read(words, np.uint64(at[look]))
-            slots[np.uint64(0), np.uint64(made)], slots[ONE_, np.uint64(made)] = lane - 1, count
+            slots[np.uint64(0), np.uint64(made)], slots[ONE_, np.uint64(made)] = np.int64(j), count
             slots[TWO_, np.uint64(made)] = pitch if grid < fines else 0
             made += 1
         for i in range(np.uint64(made)):
@@ -254,6 +242,6 @@ def whole_of_words(
             found = (
                 sum_of_means(words, pitch, at, parts, np.uint64(64) * i, count)
                 if pitch
-                else sum_of(words, at, np.uint64(64) * i, count)
+                else sum_of_words(words, at, np.uint64(64) * i, np.uint64(count))
             )
             show(rays, j, found, rays[GAINS + j] * rays[HIDDEN + j] * unit, BIAS / unit)

@@ -25,14 +25,16 @@ SUB = np.uint64(64 * 23)  # of one pixel
 PATCH = np.uint64(64 * 26)
 HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))
 """Of a row: the share of each pixel that a cap hides; and 1 + the number of another that shows some of it, or 0."""
-SHOWN, CLEAR = np.uint64(64 * 45), np.uint64(64 * 48)
-"""What a row shows, three channels a pixel, and the share that is clear, thrice."""
+SHOWN, COVER = np.uint64(64 * 45), np.uint64(64 * 48)
+"""What a row shows, three channels a pixel, and the share that is hidden, thrice."""
 WEIGHT, STRETCH = np.uint64(64 * 51), np.uint64(64 * 52)
 SPREAD, PER = np.uint64(64 * 53), np.uint64(64 * 54)
 """Of a pixel's own rays: see `cross`, and how a box's size follows from how far a ray looks (`cap_edges`)."""
 HELD = np.uint64(64 * 55)
 """Weights of rays whose boxes are on their way from memory."""
-PLANES = 83
+MARK = np.uint64(64 * 83)
+"""Of a row: above 0 in the lanes that something is to be done about."""
+PLANES = 84
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)

@@ -22,6 +22,7 @@ from .cap_rays import (
     HIDDEN,
     KX,
     KY,
+    MARK,
     ONE,
     PX,
     PY,
@@ -31,13 +32,15 @@ from .cap_rays import (
     of_row,
     take_up,
 )
-from .cap_tiles import OUT_RIVAL, OUT_RIVALS, along, down, value_on
-from .compile import fused, fused_part
+from .cap_tiles import OUT_RADIUS, OUT_RIVAL, OUT_RIVALS, OUT_X, OUT_Y, along, down, value_on
+from .cap_vectors import above_zero, lanes_from, lowest
+from .compile import compiled, fused, fused_part
 
 SIDE = 4  # samples along a pixel's side where a cap hangs over
 SAGITTA = np.float32(1.1 / 24)
 """How far an arc is from its tangent in the mean, over the square of its length and its curvature: 1/24; arcs across a
 pixel are somewhat longer than its side."""
+FAR_LESS = np.float32(1e9)  # room: none at all
 ALIKE = 1e-6  # of a cap's room: less of a difference is rounding
 
 
@@ -117,35 +120,35 @@ def contacts(tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, line: Any
 
 
 @fused_part
+def _is_inside(rays: Any, lane: Any, edge: Any) -> Any:
+    """Whether eight lanes surely are inside the contact circle."""
+    return rays[ROOM + np.uint64(lane)] > edge and rays[ROOM + np.uint64(lane + 7)] > edge
+
+
+@fused_part
 def shares_of_row(
-    tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, hangs: bool, cap: Any,
+    tile: Any, t: Any, s: Any, lanes: Any, low: Any, high: Any, edge: Any, wide: Any, hangs: bool, cap: Any,
     line: Any, rays: Any,
 ) -> None:  # fmt: skip
     """Fill the plane `HIDDEN`: how much of each pixel of a row the cap hides.
 
-    edge: room beyond which a pixel is surely inside, or, negative, outside.
+    low, high: lanes before and from which on none meets the cap's contact circle. edge: room beyond which a pixel is
+    surely inside, or, negative, outside.
     """
     for j in range(np.uint64(64)):
         rays[HIDDEN + j] = ONE if rays[ROOM + j] > edge else ZERO
         rays[RIVAL + j] = ZERO
     of_row(tile, t, line)
-    low, high = 0, lanes
-    while low < high and not rays[ROOM + np.uint64(low)] > -edge:
-        low += 1
-    while low < high and not rays[ROOM + np.uint64(high - 1)] > -edge:
-        high -= 1
-    first, last = low, high
-    while first < high and not rays[ROOM + np.uint64(first)] > edge:
-        first += 1
-    while last > first and not rays[ROOM + np.uint64(last - 1)] > edge:
-        last -= 1
-    if last < high:  # whole vectors may overwrite what comes after
-        contacts(tile, t, s, last, high, cap, line, rays)
-    if low < first:
-        contacts(tile, t, s, low, first, cap, line, rays)
-        for j in range(np.uint64(first), np.uint64(min(low + (first - low + 7) // 8 * 8, last))):
-            rays[HIDDEN + j] = ONE
-    for j in range(np.uint64(high), np.uint64(64)):
+    first, last = low // 8 * 8, (high + 7) // 8 * 8
+    left, right = first, last  # whole vectors inside the circle: a row meets it in one piece
+    while left < last and not _is_inside(rays, left, edge):
+        left += 8
+    while right > left and not _is_inside(rays, right - 8, edge):
+        right -= 8
+    for side in range(2):
+        begin, end = (first, left) if side == 0 else (right, last)
+        contacts(tile, t, s, begin, end, cap, line, rays)
+    for j in range(np.uint64(lanes), np.uint64(64)):
         rays[HIDDEN + j] = ZERO
     if hangs:
         _by_sides(tile, t, s, lanes, edge, wide, cap, line, rays)
@@ -156,14 +159,24 @@ def _by_sides(tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, cap: 
     """Add what a cap that hangs over hides by its side."""
     take_up(line, s, 0, (lanes + 7) // 8 * 8, rays)
     depth, radius = np.float32(cap[CAP_DEPTH]), np.float32(math.sqrt(cap[CAP_SQUARE]))
-    for j in range(np.uint64(lanes)):  # what the ray has to go yet to where it is closest to the sphere's centre
-        kx, ky = rays[KX + j], rays[KY + j]
-        kz = np.float32(math.sqrt(ONE - kx * kx - ky * ky))
-        rays[FREE + j] = rays[PX + j] * kx + rays[PY + j] * ky + kz * depth
-    near = np.float32(2) * wide
+    broad, two, square = np.float32(wide), np.float32(2), radius * radius
+    near, out = two * broad, (radius + broad) * (radius + broad)
     for j in range(np.uint64(lanes)):
-        if rays[ROOM + j] > edge or not rays[FREE + j] < near or not rays[HIDDEN + j] < ONE:
-            continue  # only before it can it meet the side
+        px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
+        kz = np.float32(math.sqrt(ONE - kx * kx - ky * ky))
+        b = px * kx + py * ky + kz * depth  # what the ray has to go yet to where it is closest to the sphere's centre
+        gx, gy, r2 = b * kx - px, b * ky - py, px * px + py * py
+        past = -broad * (two * np.float32(math.sqrt(gx * gx + gy * gy)) + broad)  # more than a pixel beside the sphere
+        meets = ONE if b * b + square - r2 >= past else ZERO
+        meets = ONE if r2 <= out else meets
+        meets = meets if b < near else ZERO  # only before it can it meet the side
+        meets = meets if rays[HIDDEN + j] < ONE else ZERO
+        rays[MARK + j] = ZERO if rays[ROOM + j] > edge else meets
+        rays[FREE + j] = b
+    left = lanes_from(above_zero(rays, MARK), 0, lanes)
+    while left:
+        j = lowest(left)
+        left &= left - np.uint64(1)
         at = s + np.float32(np.int32(j))
         px, py, kx, ky = value_on(tile, 0, t, at), value_on(tile, 1, t, at), rays[KX + j], rays[KY + j]
         xu, xv, yu, yv = along(tile, 0, t, at), down(tile, 0, t, at), along(tile, 1, t, at), down(tile, 1, t, at)
@@ -177,35 +190,68 @@ def _by_sides(tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, cap: 
 
 @fused
 def taken(
-    tile: Any, t: Any, s: Any, lanes: Any, wide: Any, caps: Any, number: Any, rivals: Any, outline: Any, line: Any,
-    rays: Any,
+    tile: Any, t: Any, s: Any, u: Any, v: Any, lanes: Any, wide: Any, caps: Any, number: Any, rivals: Any,
+    outlines: Any, line: Any, rays: Any,
 ) -> None:  # fmt: skip
     """Give up the pixels of a row where another cap, that may hide some of them, has more room; and note in `RIVAL`
-    which may have more in a part of those that are kept.
+    which may have more in a part of those that are kept. u, v: column of lane 0, and row; others' outlines say which
+    lanes may be theirs.
 
     As in `drop_grid`, room is counted from the circle that a cap covers seen along the normal: its sphere's, if it
     hangs over.
     """
-    of_row(tile, t, line)
-    take_up(line, s, 0, (lanes + 7) // 8 * 8, rays)
-    first = int(outline[OUT_RIVAL])
-    for i in range(first, first + int(outline[OUT_RIVALS])):
+    first, known = int(outlines[number, OUT_RIVAL]), False
+    for i in range(first, first + int(outlines[number, OUT_RIVALS])):
         other = rivals[i]
+        radius, far = outlines[other, OUT_RADIUS], v - outlines[other, OUT_Y]
+        square_half = radius * radius - far * far
+        if not square_half > 0:
+            continue
+        half, middle = math.sqrt(square_half), outlines[other, OUT_X] - u
+        begin, end = int(max(math.ceil(middle - half), 0)) // 8 * 8, int(min(math.floor(middle + half) + 1, lanes))
+        if begin >= end:
+            continue
+        if not known:
+            of_row(tile, t, line)
+            take_up(line, s, 0, (lanes + 7) // 8 * 8, rays)
+            known = True
         dx, dy, need = from_rival(caps, number, other)
         square, depth = np.float32(caps[other, CAP_SQUARE]), np.float32(caps[other, CAP_DEPTH])
         edge = np.float32(1.45 * math.sqrt(caps[other, CAP_SQUARE]) * wide + wide * wide)
         part = np.float32(1.45 * math.sqrt(dx * dx + dy * dy) * wide)  # how much rooms differ within a pixel
         name = np.float32(other + 1)
-        for j in range(np.uint64(lanes)):
+        for j in range(np.uint64(begin), np.uint64(begin + (end - begin + 7) // 8 * 8)):
             px, py, kx, ky = rays[PX + j] - dx, rays[PY + j] - dy, rays[KX + j], rays[KY + j]
             room = square - px * px - py * py
             b = px * kx + py * ky + np.float32(math.sqrt(ONE - kx * kx - ky * ky)) * depth
-            by_side = b * b + room if b < ZERO else room
+            by_side = room + b * b if b < ZERO else room
             more = room - (rays[ROOM + j] + need)
-            if by_side > -edge and more > -part:
-                if more > ZERO:
-                    rays[HIDDEN + j] = ZERO
-                rays[RIVAL + j] = name
+            more = more if by_side > -edge else -FAR_LESS
+            rays[HIDDEN + j] = ZERO if more > ZERO else rays[HIDDEN + j]
+            rays[RIVAL + j] = name if more > -part else rays[RIVAL + j]
+
+
+@compiled
+def count_rivals(x: Any, y: Any, radius: Any, counts: Any) -> None:
+    """How many other circles, (N,) each, meet each; none meets one without a radius."""
+    for i in range(len(x)):
+        found = 0
+        for j in range(len(x)):
+            dx, dy, reach = x[i] - x[j], y[i] - y[j], radius[i] + radius[j]
+            found += (dx * dx + dy * dy < reach * reach) & (radius[j] > 0)
+        counts[i] = found - 1 if radius[i] > 0 else 0
+
+
+@compiled
+def list_rivals(x: Any, y: Any, radius: Any, rivals: Any) -> None:
+    """Their numbers, in the order of the circles that they meet, and of their own."""
+    at = 0
+    for i in range(len(x)):
+        for j in range(len(x)):
+            dx, dy, reach = x[i] - x[j], y[i] - y[j], radius[i] + radius[j]
+            if dx * dx + dy * dy < reach * reach and radius[i] > 0 and radius[j] > 0 and i != j:
+                rivals[at] = j
+                at += 1
 
 
 @fused_part

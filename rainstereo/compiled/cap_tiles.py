@@ -32,7 +32,7 @@ from .cap_rays import (
     room_of_row,
     take_up,
 )  # fmt: skip
-from .compile import fused, fused_part
+from .compile import fused_part
 
 TILE = 56  # pixels along a side, at most
 TINY = 2.5
@@ -96,7 +96,7 @@ def next_span(tile: Any, t: Any, s: Any, lanes: Any, cap: Any, slack: Any, line:
     return low, high
 
 
-@fused
+@fused_part
 def trace_lanes(
     tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, later: Any, view: Any, line: Any,
     rays: Any, to: Any,
@@ -119,24 +119,27 @@ def row_of_tile(
     Returns the first lane all of whose rays beside it are lit, and that after the last.
     """
     low, high = span
-    if low < high:
-        trace_lanes(tile, t, s - HALF, low, high + 1, cap, later, view, line, rays, SIDES)
-        if is_first:
-            trace_lanes(tile, t - HALF, s - HALF, low, high + 1, cap, later, view, line, rays, ABOVE)
     first, last = span
     if following[0] < following[1]:
         first, last = (min(low, following[0]), max(high, following[1])) if low < high else following
-    if first < last:
-        trace_lanes(tile, t + HALF, s - HALF, first, last + 1, cap, later, view, line, rays, BELOW)
-    if not low < high:
-        return 0, 0
-    lit(rays, low, high)
-    while low < high and rays[LITS + np.uint64(low)] != WHOLE:
-        low += 1
-    while low < high and rays[LITS + np.uint64(high - 1)] != WHOLE:
-        high -= 1
-    if low < high:
-        trace_lanes(tile, t, s, low, high, cap, later, view, line, rays, OWN)
+    for which in range(4):  # one after the other, so that the machine code for it is there once
+        down, across, begin, end, to = t, s - HALF, low, high + 1 if low < high else low, SIDES
+        if which == 1:
+            down, to = t - HALF, ABOVE
+            begin = begin if is_first else end
+        elif which == 2:
+            down, begin, end, to = t + HALF, first, last + 1 if first < last else first, BELOW
+        elif which == 3:
+            if not low < high:
+                return 0, 0
+            lit(rays, low, high)
+            while low < high and rays[LITS + np.uint64(low)] != WHOLE:
+                low += 1
+            while low < high and rays[LITS + np.uint64(high - 1)] != WHOLE:
+                high -= 1
+            across, begin, end, to = s, low, high, OWN
+        if begin < end:
+            trace_lanes(tile, down, across, begin, end, cap, later, view, line, rays, to)
     return low, high
 
 

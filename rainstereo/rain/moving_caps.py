@@ -248,19 +248,21 @@ class CapTable:
 
     @cached_property
     def _rivals(self) -> tuple[Indices, Indices]:
-        x, y, radius = self.circles.T
+        x, y, radius = np.ascontiguousarray(self.circles.T)
+        count = len(self.caps)
+        if count <= FEW:
+            from rainstereo.compiled import cap_shares as loops
+
+            counts = np.empty(count, dtype=np.int64)
+            loops.count_rivals(x, y, radius, counts)
+            first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+            rivals = np.empty(first[-1], dtype=np.int64)
+            loops.list_rivals(x, y, radius, rivals)
+            return first, rivals
         shown = np.flatnonzero(radius > 0)
-        x, y, radius = x[shown], y[shown], radius[shown]
-        if len(shown) <= FEW:
-            apart = np.square(x[:, None] - x) + np.square(y[:, None] - y)
-            meets = apart < np.square(radius[:, None] + radius)
-            np.fill_diagonal(meets, False)
-            one, other = np.nonzero(meets)
-        else:
-            one, other = touching(x, y, radius)
-            one, other = np.concatenate([one, other]), np.concatenate([other, one])
-        one, other = shown[one], shown[other]
-        first = np.concatenate([[0], np.cumsum(np.bincount(one, minlength=len(self.caps)))]).astype(np.int64)
+        one, other = touching(x[shown], y[shown], radius[shown])
+        one, other = shown[np.concatenate([one, other])], shown[np.concatenate([other, one])]
+        first = np.concatenate([[0], np.cumsum(np.bincount(one, minlength=count))]).astype(np.int64)
         return first, other[np.argsort(one, kind="stable")].astype(np.int64)
 
     # -- drawn ---------------------------------------------------------------------------------------------------------

@@ -18,8 +18,9 @@ from rainstereo.types import Array, Indices
 
 from .contacts import clusters, touching
 
-AROUND = 16
-HEIGHTS = 2
+SEEN, AROUND, HEIGHTS = 5, 16, 2
+"""Points of a circle whose image is found, and those, of a polygon around it, that are interpolated between them: along
+the image of a small circle, with two frequencies, what is left out is of the third order in its size."""
 BLOCK = 4096  # drops whose circles are found at a time
 MARGIN = 2.5
 """Pixels around a drop that are its own too: a ring without any of it, so that two groups share no pixel."""
@@ -48,16 +49,17 @@ class Outlines:
     @classmethod
     def _of_some(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> Outlines:
         frame = PanelFrame.of(chamber)
-        phi = np.linspace(0, 2 * math.pi, AROUND, endpoint=False)
-        ring = np.stack([np.cos(phi), np.sin(phi)], -1) / math.cos(math.pi / AROUND)  # encloses the circle
+        phi = 2 * math.pi / SEEN * np.arange(SEEN)
+        ring = np.stack([np.cos(phi), np.sin(phi)], -1)
         bases = _bases(drops, frame, chamber)
         reach, top = (np.array([getattr(drop, name) for drop in drops]) for name in ("reach", "top"))
         top *= [1 if drop.face == "far" else -1 for drop in drops]
-        points = np.broadcast_to(bases[:, None, None], (len(drops), HEIGHTS, AROUND, 3)).copy()
+        points = np.broadcast_to(bases[:, None, None], (len(drops), HEIGHTS, SEEN, 3)).copy()
         points[..., :2] += reach[:, None, None, None] * ring
         points[..., 2] += (top[:, None] * np.linspace(0, 1, HEIGHTS))[..., None]
         pixels = project(frame.to_camera(points.reshape(-1, 3)), camera, chamber)[0]
-        u, v = np.ascontiguousarray(pixels.T).reshape(2, len(drops), -1)  # rows of numbers: five times as fast
+        rings = np.ascontiguousarray(pixels.T).reshape(2, -1, SEEN) @ _BETWEEN
+        u, v = rings.reshape(2, len(drops), -1)
         middle = np.stack([0.5 * (u.min(1) + u.max(1)), 0.5 * (v.min(1) + v.max(1))], -1)
         radius = np.sqrt((np.square(u - middle[:, :1]) + np.square(v - middle[:, 1:])).max(1)) + MARGIN
         seen = np.isfinite(radius)
@@ -162,10 +164,26 @@ def _ranges(first: Indices, last: Indices) -> tuple[Indices, Indices]:
     return which, first[which] + step
 
 
+def _between() -> Array:
+    """(SEEN, AROUND): from numbers at points of a circle to those at the corners of a polygon that encloses it."""
+    here, there = (2 * math.pi / n * np.arange(n) for n in (SEEN, AROUND))
+    reach = 1 / math.cos(math.pi / AROUND)
+    found: Array = np.full((SEEN, AROUND), 1 / SEEN)
+    for k in (1, 2):
+        found += 2 / SEEN * reach**k * np.cos(k * (there - here[:, None]))
+    return found
+
+
+_BETWEEN = _between()
+
+
 def _bases(drops: Sequence[Drop], frame: PanelFrame, chamber: Chamber) -> Array:
     """Points of the faces where drops sit, (N, 3), in the panel frame."""
     places = {(drop.panel, drop.face) for drop in drops}
     origins = {place: frame.base(chamber, (0.0, 0.0), *place) for place in places}
-    bases = np.array([origins[drop.panel, drop.face] for drop in drops])
-    bases[:, :2] += [drop.centre for drop in drops]
+    if len(places) == 1:
+        bases = np.tile(origins.popitem()[1], (len(drops), 1))
+    else:
+        bases = np.array([origins[drop.panel, drop.face] for drop in drops])
+    bases[:, :2] += np.array([drop.centre for drop in drops])
     return bases

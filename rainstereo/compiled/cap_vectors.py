@@ -1,0 +1,198 @@
+"""Steps of the loops over caps that numba's compiler puts into no vectors by itself: sums, and lanes that are few.
+
+They are written for that compiler in LLVM's own language, as in `eights`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from .boxes import BITS
+from .compile import fused_part
+
+ir: Any = vars(cgutils)["ir"]  # of llvmlite, which numba brings along
+WIDE = 8
+FOUR, LONG, REAL = ir.IntType(32), ir.IntType(64), ir.FloatType()
+WORDS, REALS = ir.VectorType(FOUR, WIDE), ir.VectorType(REAL, WIDE)
+FIELD = (1 << BITS) - 1
+ALL_LANES = 64
+
+
+def _data(context: Any, builder: Any, signature: Any, given: Any) -> list[Any]:
+    """Arguments, arrays as where their elements begin."""
+    return [
+        context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
+        for kind, value in zip(signature.args, given, strict=True)
+    ]
+
+
+def _load(builder: Any, data: Any, at: Any, kind: Any) -> Any:
+    place = builder.bitcast(builder.gep(data, [at]), kind.as_pointer())
+    return builder.load(place, align=4)
+
+
+def _all(value: int) -> Any:
+    return ir.Constant(WORDS, [value] * WIDE)
+
+
+def _gathered(builder: Any, words: Any, numbers: Any, first: Any) -> Any:
+    """Eight words, at the places that `numbers` holds from `first` on."""
+    found = ir.Constant(WORDS, ir.Undefined)
+    for lane in range(WIDE):
+        number = builder.load(builder.gep(numbers, [builder.add(first, LONG(lane))]))
+        word = builder.load(builder.gep(words, [builder.zext(number, LONG)]))
+        found = builder.insert_element(found, word, FOUR(lane))
+    return found
+
+
+def _folded(builder: Any, values: Any, add: Any, lanes: int) -> Any:
+    """The sum over a vector's lanes."""
+    while lanes > 1:
+        lanes //= 2
+        nothing = ir.Constant(values.type, ir.Undefined)
+        low, high = (
+            builder.shuffle_vector(
+                values, nothing, ir.Constant(ir.VectorType(FOUR, lanes), list(range(first, first + lanes)))
+            )
+            for first in (0, lanes)
+        )
+        values = add(low, high)
+    return builder.extract_element(values, FOUR(0))
+
+
+@intrinsic
+def _above_zero(_context: Any, rays: Any, plane: Any) -> Any:
+    """above_zero(rays, plane): which of a plane's 64 lanes are, as bits."""
+
+    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        data, first = _data(context, builder, signature, given)
+        bits = LONG(0)
+        for lane in range(0, ALL_LANES, WIDE):
+            values = _load(builder, data, builder.add(first, LONG(lane)), REALS)
+            above = builder.fcmp_ordered(">", values, ir.Constant(REALS, [0.0] * WIDE))
+            part = builder.zext(builder.bitcast(above, ir.IntType(WIDE)), LONG)
+            bits = builder.or_(bits, builder.shl(part, LONG(lane)))
+        return bits
+
+    return types.uint64(rays, types.uint64), code
+
+
+@intrinsic
+def _lowest(_context: Any, _bits: Any) -> Any:
+    """lowest(bits): the number of the lowest bit of some that are not 0."""
+
+    def code(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+        return builder.cttz(given[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.uint64(types.uint64), code
+
+
+@intrinsic
+def _thrice(_context: Any, rays: Any, _source: Any, _to: Any) -> Any:
+    """thrice(rays, source, to): write each of 8 numbers three times, side by side, `to` on."""
+
+    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        data, source, to = _data(context, builder, signature, given)
+        values = _load(builder, data, source, REALS)
+        nothing = ir.Constant(REALS, ir.Undefined)
+        for part in range(3):
+            which = ir.Constant(WORDS, [(WIDE * part + lane) // 3 for lane in range(WIDE)])
+            place = builder.bitcast(builder.gep(data, [builder.add(to, LONG(WIDE * part))]), REALS.as_pointer())
+            builder.store(builder.shuffle_vector(values, nothing, which), place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(rays, types.uint64, types.uint64), code
+
+
+@intrinsic
+def _sum_of_16(_context: Any, rays: Any, _first: Any) -> Any:
+    """sum_of_16(rays, first): of sixteen numbers."""
+
+    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        data, first = _data(context, builder, signature, given)
+        values = builder.fadd(
+            _load(builder, data, first, REALS), _load(builder, data, builder.add(first, LONG(WIDE)), REALS)
+        )
+        return _folded(builder, values, builder.fadd, WIDE)
+
+    return types.float32(rays, types.uint64), code
+
+
+@intrinsic
+def _weighed(_context: Any, words: Any, at: Any, _first: Any, rays: Any, _weights: Any) -> Any:
+    """weighed(words, at, first, rays, weights): the three channels' weighted sums of 16 words, and the weights' sum.
+
+    at: numbers of words, from `first` on; their weights stand among `rays`.
+    """
+
+    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        texels, numbers, first, data, weights = _data(context, builder, signature, given)
+        sums: list[Any] = []
+        for half in (0, WIDE):
+            found = _gathered(builder, texels, numbers, builder.add(first, LONG(half)))
+            weight = _load(builder, data, builder.add(weights, LONG(half)), REALS)
+            parts = [builder.and_(builder.lshr(found, _all(BITS * channel)), _all(FIELD)) for channel in range(3)]
+            new = [builder.fmul(builder.sitofp(part, REALS), weight) for part in parts] + [weight]
+            sums = [builder.fadd(old, one) for old, one in zip(sums, new, strict=True)] if sums else new
+        return context.make_tuple(
+            builder, signature.return_type, [_folded(builder, part, builder.fadd, WIDE) for part in sums]
+        )
+
+    four: Any = vars(types)["UniTuple"](types.float32, 4)
+    return four(words, at, types.uint64, rays, types.uint64), code
+
+
+@intrinsic
+def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any) -> Any:
+    """sum_of_words(words, at, first, count): of up to 64 words, as if each had been spread (`boxes.spread`).
+
+    at: their numbers, from `first` on, up to a multiple of 8 of which those after `count` are any words'.
+    """
+
+    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        texels, numbers, first, count = _data(context, builder, signature, given)
+        outer = FIELD | FIELD << 2 * BITS
+        before, loop, after = builder.block, builder.append_basic_block("eight"), builder.append_basic_block("sum")
+        limit = builder.insert_element(ir.Constant(WORDS, ir.Undefined), builder.trunc(count, FOUR), FOUR(0))
+        limit = builder.shuffle_vector(limit, ir.Constant(WORDS, ir.Undefined), _all(0))
+        builder.branch(loop)
+        builder.position_at_end(loop)
+        done, lanes = builder.phi(LONG), builder.phi(WORDS)
+        sums = [builder.phi(WORDS) for _ in range(2)]
+        found = _gathered(builder, texels, numbers, builder.add(first, done))
+        found = builder.select(builder.icmp_unsigned("<", lanes, limit), found, _all(0))
+        parts = builder.and_(found, _all(outer)), builder.and_(builder.lshr(found, _all(BITS)), _all(FIELD))
+        added = [builder.add(old, one) for old, one in zip(sums, parts, strict=True)]
+        further, next_lanes = builder.add(done, LONG(WIDE)), builder.add(lanes, _all(WIDE))
+        builder.cbranch(builder.icmp_unsigned("<", further, count), loop, after)
+        starts = LONG(0), ir.Constant(WORDS, list(range(WIDE))), _all(0), _all(0)
+        for phi, start, new in zip((done, lanes, *sums), starts, (further, next_lanes, *added), strict=True):
+            phi.add_incoming(start, before)
+            phi.add_incoming(new, loop)
+        builder.position_at_end(after)  # the last channel may have 12 bits: its sum is not folded beside the first's
+        first_middle = builder.or_(builder.and_(added[0], _all((1 << 16) - 1)), builder.shl(added[1], _all(16)))
+        last = builder.zext(_folded(builder, builder.lshr(added[0], _all(2 * BITS)), builder.add, WIDE), LONG)
+        both = builder.zext(_folded(builder, first_middle, builder.add, WIDE), LONG)
+        low, middle = builder.and_(both, LONG((1 << 16) - 1)), builder.lshr(both, LONG(16))
+        return builder.or_(low, builder.or_(builder.shl(last, LONG(20)), builder.shl(middle, LONG(40))))
+
+    return types.uint64(words, at, types.uint64, types.uint64), code
+
+
+above_zero: Any = _above_zero
+lowest: Any = _lowest
+thrice: Any = _thrice
+sum_of_16: Any = _sum_of_16
+weighed: Any = _weighed
+sum_of_words: Any = _sum_of_words
+
+
+@fused_part
+def lanes_from(marked: Any, low: Any, high: Any) -> Any:
+    """Those bits of 64 that stand for lanes low to before high; high: below 64."""
+    one = np.uint64(1)
+    return marked & ((one << np.uint64(high)) - (one << np.uint64(low))) if low < high else np.uint64(0)

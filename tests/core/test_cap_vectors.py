@@ -1,0 +1,101 @@
+"""Vector steps of the loops over caps against numpy; circles in the image against many points of drops."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rainstereo import Camera, Chamber, Panel
+from rainstereo.compiled import available
+from rainstereo.droplet import SphericalCap
+from rainstereo.panel_plane import PanelFrame
+from rainstereo.rain.outlines import MARGIN, Outlines
+from rainstereo.refraction import project
+
+needs_numba = pytest.mark.skipif(not available(), reason="needs numba: pip install rainstereo[fast]")
+
+
+@needs_numba
+def test_sums_are_those_of_channels():
+    from rainstereo.compiled import cap_vectors
+    from rainstereo.compiled.boxes import channels_of
+    from rainstereo.compiled.compile import fused_part
+
+    @fused_part
+    def of_words(words, at, first, count):
+        return channels_of(cap_vectors.sum_of_words(words, at, first, count))
+
+    @fused_part
+    def of_weights(words, at, first, rays, weights):
+        return cap_vectors.weighed(words, at, first, rays, weights)
+
+    rng = np.random.default_rng(0)
+    bytes_ = rng.integers(0, 256, (500, 3)).astype(np.uint32)
+    bytes_[:100] = 255  # the largest sums there can be
+    words = bytes_[:, 0] | bytes_[:, 1] << np.uint32(10) | bytes_[:, 2] << np.uint32(20)
+    for count in (1, 7, 8, 9, 24, 36, 63, 64):
+        for most in (100, 500):
+            at = rng.integers(0, most, 72).astype(np.uint32)
+            found = of_words(words, at, np.uint64(8), np.uint64(count))
+            np.testing.assert_array_equal(found, bytes_[at[8 : 8 + count]].sum(0))
+    rays = rng.uniform(0, 1, 128).astype(np.float32)
+    found = of_weights(words, at, np.uint64(3), rays, np.uint64(40))
+    np.testing.assert_allclose(found[:3], rays[40:56] @ bytes_[at[3:19]], rtol=1e-6)
+    assert found[3] == pytest.approx(rays[40:56].sum(), rel=1e-6)
+
+
+@needs_numba
+def test_lanes_are_found_by_bits_and_written_thrice():
+    from rainstereo.compiled import cap_vectors
+    from rainstereo.compiled.compile import fused_part
+
+    @fused_part
+    def lanes(rays, low, high, found):
+        left, count = cap_vectors.lanes_from(cap_vectors.above_zero(rays, np.uint64(16)), low, high), 0
+        while left:
+            found[count] = cap_vectors.lowest(left)
+            left &= left - np.uint64(1)
+            count += 1
+        return count
+
+    @fused_part
+    def copied(rays, source, to):
+        cap_vectors.thrice(rays, source, to)
+        return cap_vectors.sum_of_16(rays, to)
+
+    rng = np.random.default_rng(1)
+    rays = np.concatenate([np.ones(16), rng.uniform(-1, 1, 64), np.ones(48)]).astype(np.float32)
+    rays[20], rays[21] = 0.0, np.nan
+    for low, high in ((0, 56), (3, 63), (17, 18), (9, 9), (12, 5)):
+        found = np.zeros(64, dtype=np.int64)
+        count = lanes(rays, low, high, found)
+        expected = low + np.flatnonzero(rays[16 + low : 16 + max(low, high)] > 0)
+        np.testing.assert_array_equal(found[:count], expected)
+    rays[21] = 0.5
+    total = copied(rays, np.uint64(16), np.uint64(90))
+    np.testing.assert_array_equal(rays[90:114], np.repeat(rays[16:24], 3))
+    assert rays[114] == 1.0
+    assert total == pytest.approx(rays[90:106].sum(), rel=1e-6)
+
+
+@pytest.mark.parametrize(("normal", "coefficients"), [((0, 0, 1), ()), ((0.3, -0.2, 0.93), (-0.2, 0.05, 1e-3, -5e-4))])
+def test_outlines_enclose_drops_whose_images_are_bent(normal, coefficients):
+    """Five points are traced of each ring; all others must lie inside, and not far inside."""
+    numbers = np.array([1200, 1200, 639.5, 479.5, *coefficients])
+    camera = Camera("LENSMODEL_OPENCV4" if coefficients else "LENSMODEL_PINHOLE", numbers, 1280, 960)
+    chamber = Chamber(tuple(np.array(normal) / np.linalg.norm(normal)), 0.05, (Panel(0.003, 1.49),))
+    rng = np.random.default_rng(2)
+    drops = [
+        SphericalCap((float(x), float(y)), float(radius), float(angle))
+        for x, y, radius, angle in rng.uniform((-0.02, -0.015, 3e-4, 0.3), (0.02, 0.015, 4e-3, 2.2), (60, 4))
+    ]
+    found = Outlines.of(drops, camera, chamber)
+    frame, phi = PanelFrame.of(chamber), np.linspace(0, 2 * math.pi, 90)
+    for i, drop in enumerate(drops):
+        base = frame.base(chamber, drop.centre, 0, "far")
+        ring = np.stack([drop.reach * np.cos(phi), drop.reach * np.sin(phi), 0 * phi], -1)
+        points = base + np.concatenate([ring + (0, 0, part * drop.top) for part in (0, 0.3, 1)])
+        pixels = project(frame.to_camera(points), camera, chamber)[0]
+        if found.radius[i] > 0:
+            farthest = np.hypot(pixels[:, 0] - found.x[i], pixels[:, 1] - found.y[i]).max()
+            assert farthest + 0.95 * MARGIN < found.radius[i] < 1.03 * farthest + MARGIN
