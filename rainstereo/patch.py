@@ -106,21 +106,7 @@ class Patch:
 
         clear: transmittance of the bare panels, (h', w') or one number; 1 leaves their loss in the gain.
         """
-        status = traced.status
-        opacity = ~np.isin(traced.fate, np.array(UNCOVERED, dtype=np.uint8))
-        source: Image = np.array(traced.source, dtype=np.float32)
-        lit = status == Fate.THROUGH
-        unseen = (status == Fate.NO_IMAGE) & opacity
-        if unseen.any():  # the lens model cannot say which pixel it is, but outside the image it is
-            source[unseen] = _outside(traced, unseen)
-            lit |= unseen
-        with np.errstate(invalid="ignore", divide="ignore"):
-            gain: Image = np.where(lit & opacity, traced.transmittance / clear, 0).astype(np.float32)
-        lost = ~(lit & np.isfinite(source).all(-1) & np.isfinite(gain))
-        source[lost] = 0
-        gain[lost] = 0
-        covered: Image = opacity.astype(np.float32)
-        return cls(rows, columns, source, gain, covered, density)
+        return cls(rows, columns, *answers(traced, clear), density)
 
     def at(self, depth: float) -> Patch:
         """The same drops before a plane at another depth, metres, without tracing; needs `keep` of `trace`."""
@@ -187,6 +173,25 @@ class Patch:
         found = found.reshape(*at.shape[:2], *image.shape[2:])
         colour: Image = cv2.multiply(found, like(self.gain * self.opacity, found), dtype=cv2.CV_32F)
         return colour.reshape(found.shape), self.opacity
+
+
+def answers(traced: Trace, clear: Array | float = 1.0) -> tuple[Array, Array, Array]:
+    """Source, gain and opacity of a trace's samples, as a `Patch` has them; see `Patch.of_trace`."""
+    status = traced.status
+    opacity = ~np.isin(traced.fate, np.array(UNCOVERED, dtype=np.uint8))
+    source: Image = np.array(traced.source, dtype=np.float32)
+    lit = status == Fate.THROUGH
+    unseen = (status == Fate.NO_IMAGE) & opacity
+    if unseen.any():  # the lens model cannot say which pixel it is, but outside the image it is
+        source[unseen] = _outside(traced, unseen)
+        lit |= unseen
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gain: Image = np.where(lit & opacity, traced.transmittance / clear, 0).astype(np.float32)
+    lost = ~(lit & np.isfinite(source).all(-1) & np.isfinite(gain))
+    source[lost] = 0
+    gain[lost] = 0
+    covered: Image = opacity.astype(np.float32)
+    return source, gain, covered
 
 
 def sample_shape(rows: slice, columns: slice, density: float) -> tuple[int, int]:
@@ -324,4 +329,4 @@ def _text(part: slice) -> str:
     return f"{part.start}..{part.stop}"
 
 
-__all__ = ["BORDERS", "Patch", "folded", "ratio", "resampled", "sample_pixels", "sample_shape"]
+__all__ = ["BORDERS", "Patch", "answers", "folded", "ratio", "resampled", "sample_pixels", "sample_shape"]
