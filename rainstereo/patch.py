@@ -127,9 +127,10 @@ class Patch:
             raise ValueError(f"{self.opacity.shape} samples do not divide into {pixels} x {pixels}")
 
         def mean(values: Array) -> Image:
-            blocks = values.reshape(shape[0], pixels, shape[1], pixels, *values.shape[2:])
-            averaged: Image = blocks.mean((1, 3), dtype=np.float32)
-            return averaged
+            if not values.size:
+                return values.reshape(*shape, *values.shape[2:])
+            averaged: Image = cv2.resize(values, shape[::-1], interpolation=cv2.INTER_AREA)  # of whole blocks
+            return averaged.reshape(*shape, *values.shape[2:])
 
         weight = self.gain * self.opacity
         opacity, light = mean(self.opacity), mean(weight)
@@ -241,14 +242,16 @@ def folded(source: Array, size: tuple[int, int], border: str = "mirror") -> Arra
     Pixels any distance outside are reflected about the centres of the outermost pixels as often as it takes, or moved
     to the nearest edge. Bilinear values are those of an image so continued.
     """
-    if border not in BORDERS:
-        raise ValueError(f"border {border!r} is unknown; expected {' or '.join(map(repr, BORDERS))}")
-    last = np.array([size[0] - 1, size[1] - 1], dtype=np.float32)
-    return folded_along(source, last, border)
+    inside: Image = np.empty(source.shape, dtype=np.float32)
+    for axis in (0, 1):  # one at a time: numpy is slow along an axis of 2
+        inside[..., axis] = folded_along(np.ascontiguousarray(source[..., axis]), size[axis] - 1, border)
+    return inside
 
 
 def folded_along(values: Array, last: Any, border: str = "mirror") -> Array:
     """One coordinate of source pixels, any shape, brought between 0 and `last`, the outermost pixel's; see `folded`."""
+    if border not in BORDERS:
+        raise ValueError(f"border {border!r} is unknown; expected {' or '.join(map(repr, BORDERS))}")
     end = np.asarray(last, dtype=np.float32)
     if border == "mirror":
         period = np.maximum(2 * end, np.float32(1))

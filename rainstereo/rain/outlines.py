@@ -150,8 +150,9 @@ class Outlines:
         for first in range(0, len(self.x), BLOCK):
             _, row, start, stop = self.take(np.arange(len(self.x))[first : first + BLOCK])._lines()
             for sign, at in ((1, start), (-1, stop)):
-                edges += sign * np.bincount(row * (width + 1) + at, minlength=len(edges)).astype(np.int32)
-        inside: Mask = np.cumsum(edges.reshape(height, width + 1), axis=1, dtype=np.int32)[:, :width] > 0
+                np.add.at(edges, row * (width + 1) + at, np.int32(sign))
+        edges = edges.reshape(height, width + 1)
+        inside: Mask = np.cumsum(edges, axis=1, dtype=np.int32, out=edges)[:, :width] > 0
         return inside
 
     def _lines(self) -> tuple[Indices, Indices, Indices, Indices]:

@@ -57,12 +57,11 @@ def retraced(
     if before is not None and before.patch.density == density:
         here, there = _shared(window, (before.patch.rows, before.patch.columns), samples)
         changed = _circles(list(set(drops) ^ set(before.drops)), camera, chamber, window, samples)
-        kept = np.zeros((height, width), dtype=np.bool_)
-        kept[here] = ~changed[here]
+        at = np.flatnonzero(changed)
         for part, old in zip(parts, (before.patch.source, before.patch.gain, before.patch.opacity), strict=True):
             part[here] = old[there]
-            part[~kept] = 0
-        asked &= ~kept
+            part.reshape(height * width, *part.shape[2:])[at] = 0
+        asked[here] &= changed[here]
     at = np.flatnonzero(asked)
     for first in range(0, len(at), RAYS):
         some = at[first : first + RAYS]
