@@ -28,9 +28,8 @@ def interleave(
     of taps of eight rows, 1 at least, by which `taps`, signed, are long: a weight, and in so many lowest bits its
     place. Rows that are missing to eight are as the last.
     """
-    rows, last = U(len(counts)), U(0)
-    tap: Any = U(0)
-    first: Any = U(0)
+    rows: Any = U(len(counts))
+    tap, first, last = rows - rows, rows - rows, rows - rows
     place: Any = np.int64(below)
     taps[:] = 0
     for eight in range(U(len(most))):

@@ -11,7 +11,7 @@ from rainstereo.droplet import SphericalCap
 from rainstereo.patch import folded
 from rainstereo.rain.pursuit import MOST, SHRUNK, Pursuit
 from rainstereo.rain.pyramid import copies, copy_starts, half, sizes, starts
-from rainstereo.rain.quadtree import UNIT, Quadtree, steps_between
+from rainstereo.rain.quadtree import UNIT, Quadtree, span_of, steps_between
 from rainstereo.rain.render import Renderer
 from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.trace import Fate, clear_transmittance, trace
@@ -81,6 +81,36 @@ def test_worth_trades_texels_for_error():
     assert counts == sorted(counts, reverse=True)
     assert errors == sorted(errors)
     assert counts[0] > 3 * counts[-1]
+
+
+def test_a_dense_place_and_what_is_far_from_it():
+    """As beside a dark rim: most rays meet in a few pixels, and the last go farther and farther.
+
+    Told apart, they are closer to points sixteen times as dense than by a window for all.
+    """
+    image, rng, count = photograph(SIZE), np.random.default_rng(9), 150
+    centre, turn = rng.uniform([120, 120], [280, 180], (count, 2)), rng.uniform(0, 2 * np.pi, count)
+
+    def rays(side: int) -> tuple[np.ndarray, np.ndarray]:
+        along = (np.arange(side) + 0.5) / side - 0.5
+        a, b = (n.reshape(-1, 1) for n in np.meshgrid(along, along))
+        out, beside = 60 * a + 75 * (np.maximum(a - 0.2, 0) / 0.3) ** 2, 8 * b
+        across, down = out * np.cos(turn) - beside * np.sin(turn), out * np.sin(turn) + beside * np.cos(turn)
+        x, y = centre.T[:, None] + [across, down]
+        return x.astype(np.float32), y.astype(np.float32)
+
+    x, y = rays(SIDE)
+    truth = cv2.remap(image, *rays(4 * SIDE), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101).mean(0)
+    own = pursuit(0.01)
+    owner, share = own._parts(x, y, even(x), span_of(x, y, even(x)))
+    assert len(owner) > 1.8 * count
+    total = np.zeros((len(x), count))
+    np.add.at(total.T, owner, share.T)
+    np.testing.assert_allclose(total, even(x))
+    apart = summed(own.taps(x, y, even(x)), texels(image))
+    object.__setattr__(own, "_parts", lambda x, _y, weights, _span: (np.arange(x.shape[1]), weights))
+    together = summed(own.taps(x, y, even(x)), texels(image))
+    assert rms(apart - truth) < 0.9 * rms(together - truth)
 
 
 def test_weights_are_the_best_ones():

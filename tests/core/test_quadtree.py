@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rainstereo.rain.pyramid import half, sizes, starts
-from rainstereo.rain.quadtree import UNIT, Quadtree
+from rainstereo.patch import folded_along
+from rainstereo.rain.pyramid import copies, half, sizes, starts
+from rainstereo.rain.quadtree import UNIT, Quadtree, brought_in, steps_between
 from tests.core.texel_sums import photograph, summed
 
 SIZE = (200, 150)
@@ -112,3 +113,53 @@ def test_levels_hold_every_texel(size):
     assert starts(size)[-1] == sum(w * h for w, h in levels)
     for (w, h), (a, b) in pairwise(levels):
         assert (a, b) == ((w + 1) // 2, (h + 1) // 2)
+
+
+def test_steps_do_not_lead_to_what_another_drop_shows():
+    """A column of rays that looks elsewhere has no steps of its own; those between rays that look on are kept."""
+    x, y = pixels(5, 20, 30)
+    weights = np.full(x.shape, 1 / SIDE**2, dtype=np.float32)
+    plain = steps_between(x, y, weights)
+    far = x.reshape(SIDE, SIDE, -1).copy()
+    far[:, 0] += 5000
+    steps = steps_between(far.reshape(x.shape), y, weights)
+    for found, expected in zip(steps, plain, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-3)
+    alone = weights.copy()
+    alone.reshape(SIDE, SIDE, -1)[:, 2:] = 0  # two columns: whose steps these are cannot be told
+    steps = steps_between(far.reshape(x.shape), y, alone)
+    assert np.abs(steps[0].reshape(SIDE, SIDE, -1)[:, :2]).min() > 4000
+
+
+@pytest.mark.parametrize("border", ["mirror", "edge"])
+def test_rays_are_brought_in_with_their_steps(border):
+    """A point a little beside a ray falls, in the image, where the step that it has there leads to."""
+    rng = np.random.default_rng(6)
+    centre = rng.uniform([-900, -700], [1100, 800], (400, 2))
+    along = ((np.arange(SIDE) + 0.5) / SIDE - 0.5).astype(np.float32)
+    a, b = (n.reshape(-1, 1, 1) for n in np.meshgrid(along, along))
+    right, down = rng.uniform(-4, 4, (2, 400, 2))
+    x, y = (np.ascontiguousarray((centre + a * right + b * down)[..., i].astype(np.float32)) for i in (0, 1))
+    inside_x, inside_y, steps = brought_in(x, y, np.ones_like(x), SIZE, border)
+    for at, inside, step, n in ((x, inside_x, steps[0], SIZE[0]), (y, inside_y, steps[1], SIZE[1])):
+        np.testing.assert_array_equal(inside, folded_along(at, n - 1, border))
+        own = steps_between(x, y, np.ones_like(x))[0 if at is x else 1]
+        moved = folded_along(at + np.float32(0.01) * own, n - 1, border)
+        led = inside + np.float32(0.01) * step
+        smooth = np.abs(at % (n - 1) - (n - 1) / 2) < (n - 1) / 2 - 1  # not where it is folded
+        np.testing.assert_allclose(moved[smooth], led[smooth], atol=2e-3)
+
+
+def test_copies_are_neither_lighter_nor_darker():
+    """Means of means, rounded up and down in turn, against exact ones: within what is said of each copy."""
+    image = np.random.default_rng(8).integers(0, 256, (256, 384, 3), dtype=np.uint8)
+    level, exact = image, image.astype(np.float64)
+    for copy in copies((384, 256))[1:5]:
+        level = half(level, copy.up)
+        exact = exact.reshape(copy.height, 2, copy.width, 2, 3).mean((1, 3))
+        lighter = float((level - exact).mean())
+        assert abs(lighter - copy.bias) < 0.03
+        assert abs(lighter) < 0.16
+    flat = np.full((64, 64, 3), 77, dtype=np.uint8)
+    for up in (False, True):
+        assert (half(flat, up) == 77).all()

@@ -1,0 +1,81 @@
+"""Sums eight pixels at a time, in vectors, and quads of bytes, against whole numbers in numpy."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba", reason="numba is not installed (extra fast)")
+
+from rainstereo.compiled import quads
+from rainstereo.compiled.layout import COLUMNS, LONG_BITS, QUARTERS, ROWS, SHORT_BITS
+from rainstereo.compiled.sums import interleave, sum_quads
+
+SHIFT = 10
+
+
+def table(rng: np.random.Generator, rows: int, texels: int) -> tuple[np.ndarray, ...]:
+    """Counts, some 0, texels, weights of both signs and clear shares, some 0."""
+    counts = rng.integers(0, 9, rows).astype(np.int32)
+    counts[rng.random(rows) < 0.3] = 0
+    taps = int(counts.sum())
+    weights = rng.integers(-400, 900, taps).astype(np.int16)
+    clear = np.where(rng.random(rows) < 0.5, rng.integers(1, 1025, rows), 0).astype(np.uint16)
+    return counts, rng.integers(0, texels, taps).astype(np.int32), weights, clear
+
+
+@pytest.mark.parametrize(("kind", "bits"), [(np.int32, SHORT_BITS), (np.int64, LONG_BITS)])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize("rows", [1, 7, 8, 203])
+def test_sums_against_whole_numbers(rows, channels, kind, bits):
+    rng = np.random.default_rng(rows + channels)
+    texels, pixels = 300, rng.permutation(500)[:rows]
+    values = rng.integers(0, 256, (texels, channels), dtype=np.uint8)
+    below = rng.integers(0, 256, (500, channels), dtype=np.uint8)
+    counts, of_tap, weights, clear = table(rng, rows, texels)
+    soft = pixels[clear > 0].astype(np.uint32)
+    row = np.zeros(texels + len(soft), dtype=np.uint32)
+    quads.pack(values, row[:texels])
+    quads.pack_some(below, soft, row[texels:])
+    groups = -(-rows // 8)
+    most = np.zeros(groups, dtype=np.uint32)
+    np.maximum.at(most, np.arange(rows) // 8, np.maximum(counts + (clear > 0), 1).astype(np.uint32))
+    taps = np.empty(8 * int(most.sum()), dtype=kind)
+    places = np.arange(texels, dtype=np.uint32)
+    interleave(counts, places, of_tap, weights, clear, texels, bits, most, taps)
+    roundings = rng.integers(0, 1024, rows).astype(np.int32)
+    full = np.minimum(np.arange(8 * groups), rows - 1)
+    out = below.copy()
+    flat = out.reshape(-1)
+    sum_quads(flat, channels, row, SHIFT, pixels[full].astype(np.uint32), most, taps, roundings[full])
+
+    expected, ends = below.copy(), np.cumsum(counts)
+    for i, pixel in enumerate(pixels):
+        some = slice(ends[i] - counts[i], ends[i])
+        total = (weights[some, None].astype(int) * values[of_tap[some]]).sum(0) + int(clear[i]) * below[pixel].astype(
+            int
+        )
+        expected[pixel] = np.clip((total + roundings[i]) // 2**SHIFT, 0, 255)
+    np.testing.assert_array_equal(out, expected)
+    if rows > 100:
+        assert (expected[pixels] == 0).any()
+        assert (expected[pixels] == 255).any()
+
+
+@pytest.mark.parametrize("up", [False, True])
+@pytest.mark.parametrize("how", [QUARTERS, COLUMNS, ROWS])
+@pytest.mark.parametrize("size", [(16, 12), (13, 9), (1, 5)])
+def test_means_of_quads(how, up, size):
+    """Byte by byte, an odd last column or row being its own pair; halves go where they are to."""
+    rng = np.random.default_rng(7)
+    width, height = size
+    image = rng.integers(0, 256, (height, width, 4), dtype=np.uint8)
+    across, down = 1 if how == ROWS else 2, 1 if how == COLUMNS else 2
+    wide, high = -(-width // across), -(-height // down)
+    row = np.zeros(width * height + wide * high, dtype=np.uint32)
+    quads.pack(image.reshape(-1, 4), row[: width * height])
+    quads.average(row, np.array([[how, 0, width, height, width * height, up]]))
+    padded = np.pad(image, ((0, high * down - height), (0, wide * across - width), (0, 0)), mode="edge").astype(int)
+    total = padded.reshape(high, down, wide, across, 4).sum((1, 3))
+    count = across * down
+    more = count // 2 if up else count // 2 - 1
+    expected = (total + more) // count
+    np.testing.assert_array_equal(row[width * height :].view(np.uint8).reshape(high, wide, 4), expected)
