@@ -22,6 +22,7 @@ from rainstereo.rain.drops import Drops
 from rainstereo.rain.motion import Motion, PaneState
 from rainstereo.rain.render import Plan, Renderer
 from rainstereo.rain.sequence import Sequence as Plans
+from rainstereo.rain.sequence import TrailShapes
 from rainstereo.types import Image
 
 MotionKind = Literal["physical", "paper", "still"]
@@ -53,6 +54,7 @@ class Sequence:
     _last: tuple[PaneState, Plan] | None = field(default=None, repr=False)
     _motion: Motion | None = field(default=None, repr=False)
     _still: Plan | None = field(default=None, repr=False)
+    _trails: TrailShapes = field(default_factory=TrailShapes, init=False, repr=False)
 
     def plan(self, frame: int) -> Plan:
         """The rain in a frame, traced; a pane on which nothing moved is not traced again."""
@@ -65,8 +67,8 @@ class Sequence:
             return self._still
         state = self._moving(renderer).at(frame / drive.fps)
         if self._last is None or not _same(self._last[0], state):
-            streaks = [trail.streak(**state.drops.place) for trail in state.trails]
-            self._last = state, self._plans.plan([*streaks, self.rain.in_sight(state.drops, drive.size)])
+            trails = self._trails.of(state)
+            self._last = state, self._plans.plan([*trails, self.rain.in_sight(state.drops, drive.size)])
         return self._last[1]
 
     @cached_property

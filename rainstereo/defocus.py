@@ -17,9 +17,9 @@ the disc is made that much smaller.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -33,7 +33,7 @@ from .chamber import Chamber
 from .droplet import Drop
 from .layer import Layer, depth_of
 from .panel_plane import PanelFrame
-from .patch import Patch, folded, ratio, resampled
+from .patch import Patch, folded_along, ratio, resampled
 from .thin_lens import ThinLens
 from .types import Array, Image
 
@@ -49,6 +49,7 @@ SAME = 1.1  # ratio of discs up to which one serves all
 CELL = 16  # points along a cell's side that decide how much of it a disc covers
 COARSEST = 8  # pixels of the image averaged, along a side, before samples are taken
 FAINT = 1e-5  # opacity below which there is nothing
+Tracer = Callable[[tuple[slice, slice], float], Patch]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,15 +133,20 @@ class DefocusedPatch:
     @cached_property
     def _tables(self) -> list[tuple[Any, Any]]:
         """For each part of the disc the fixed-point maps of the covered samples into the reduced image."""
-        reduced = np.array(self._reduced_size, dtype=np.float32)
-        source: Image = np.zeros((self._sums.shape[1] // ACROSS, ACROSS, 2), dtype=np.float32)
-        source.reshape(-1, 2)[: len(self._covered)] = self.patch.source.reshape(-1, 2)[self._covered]
+        count = self._sums.shape[1]
+        source: Image = np.zeros((2, count // ACROSS, ACROSS), dtype=np.float32)
+        source.reshape(2, count)[:, : len(self._covered)] = self.patch.source.reshape(-1, 2)[self._covered].T
         tables = []
         for kernel in self._kernels:
             aside = (middle(kernel) * self.spacing * self.shift).astype(np.float32)
-            at = (folded(source - aside, self.size, self.border) + 0.5) * (reduced / self.size) - 0.5
-            at = np.clip(at, 0, reduced - 1).astype(np.float32)
-            tables.append(cv2.convertMaps(at, None, cv2.CV_16SC2))  # type: ignore[call-overload]
+            at = []
+            for along, by, wide, reduced in zip(source, aside, self.size, self._reduced_size, strict=True):
+                found = folded_along(along - by, wide - 1, self.border)
+                found += np.float32(0.5)
+                found *= np.float32(reduced / wide)
+                found -= np.float32(0.5)
+                at.append(np.clip(found, np.float32(0), np.float32(reduced - 1), out=found))
+            tables.append(cv2.convertMaps(at[0], at[1], cv2.CV_16SC2))
         return tables
 
     @cached_property
@@ -207,6 +213,7 @@ def defocused(
     density: float | None = None,
     parts: int | None = None,
     border: str = "mirror",
+    tracer: Tracer | None = None,
 ) -> DefocusedPatch:
     """Trace drops and prepare their blur: a plan for any number of frames.
 
@@ -214,6 +221,7 @@ def defocused(
     than the smallest (then give the drops of each distance on their own). depth: of the scene, metres, or inf.
     density: samples per pixel along each side that the scene is seen by, parts: of the disc; None: chosen from the
     disc's size, which measured 0.4 to 2.0 gray levels RMS against 1024 points of the aperture on contrasty pictures.
+    tracer: makes the patch of the drops in a window, at 1 or more samples a pixel; None: `Patch.trace`.
 
     A layer costs in proportion to its window times the samples of the disc: with discs of 5 to 16 pixels, which are
     blurred at every pixel, scattered drops are better given one by one.
@@ -235,7 +243,10 @@ def defocused(
     window = _window(everyone, camera, chamber, 0.5 * diameter, spacing)
     pixels = ratio(density)[1]
     # drops smaller than the disc have few samples then: at every pixel, so that their area is right
-    patch = Patch.trace(everyone, camera, chamber, depth, window=window, density=density * pixels)
+    if tracer is None:
+        patch = Patch.trace(everyone, camera, chamber, depth, window=window, density=density * pixels)
+    else:
+        patch = tracer(window, density * pixels)
     if pixels > 1:
         patch = patch.coarser(pixels)
     if parts is None:
@@ -295,17 +306,28 @@ def disc_parts(diameter: float, parts: int = 1) -> list[Array]:
     Each element holds the share of its cell that the part covers. The parts are what is nearest to each of Vogel's
     points (`ThinLens.points`).
     """
+    return list(_disc_parts(diameter, parts))
+
+
+@lru_cache(maxsize=16)
+def _disc_parts(diameter: float, parts: int) -> tuple[Array, ...]:
+    """The same, read-only: frame after frame has the same disc."""
     reach = max(0, math.ceil(0.5 * diameter - 0.5))
     side = 2 * reach + 1
     if not reach:
-        return [np.ones((1, 1), dtype=np.float32)]
+        return (_read_only(np.ones((1, 1), dtype=np.float32)),)
     at = (np.arange(side * CELL) + 0.5) / CELL - reach - 0.5
     points = np.stack(np.meshgrid(at, at), -1)
     nearest = cKDTree(middles(parts) * diameter).query(points)[1]
     nearest[(points**2).sum(-1) > (0.5 * diameter) ** 2] = parts
     shares = [(nearest == part).reshape(side, CELL, side, CELL).sum((1, 3)) for part in range(parts)]
     total = sum(int(share.sum()) for share in shares)
-    return [(share / total).astype(np.float32) for share in shares if share.any()]
+    return tuple(_read_only((share / total).astype(np.float32)) for share in shares if share.any())
+
+
+def _read_only(array: Array) -> Array:
+    array.setflags(write=False)
+    return array
 
 
 def middles(parts: int) -> Array:

@@ -56,6 +56,7 @@ def undistort(u: Array, v: Array, k: Array) -> tuple[Array, Array, Mask]:
     with np.errstate(all="ignore"):
         shrink = np.minimum(1, 0.9 * fold / np.maximum(np.hypot(u, v), 1e-300))
         x, y = u * shrink, v * shrink
+        moving = np.ones(u.shape, dtype=np.bool_)  # a point that has arrived stays, whatever others still do
         for _ in range(ITERATIONS):
             fu, fv = distort(x, y, k)
             fu, fv = fu - u, fv - v
@@ -63,9 +64,9 @@ def undistort(u: Array, v: Array, k: Array) -> tuple[Array, Array, Mask]:
             det = ux * vy - uy * vx
             dx, dy = (vy * fu - uy * fv) / det, (ux * fv - vx * fu) / det
             limit = np.minimum(1, (0.3 + 0.3 * np.hypot(x, y)) / np.maximum(np.hypot(dx, dy), 1e-300))
-            x, y = x - dx * limit, y - dy * limit
-            step = np.maximum(np.abs(dx), np.abs(dy))
-            if not np.any(step > 1e-15 * (1 + np.abs(x) + np.abs(y))):
+            x, y = np.where(moving, x - dx * limit, x), np.where(moving, y - dy * limit, y)
+            moving &= np.maximum(np.abs(dx), np.abs(dy)) > 1e-15 * (1 + np.abs(x) + np.abs(y))
+            if not moving.any():
                 break
         fu, fv = distort(x, y, k)
         scale = 1 + np.abs(u) + np.abs(v)

@@ -106,21 +106,7 @@ class Patch:
 
         clear: transmittance of the bare panels, (h', w') or one number; 1 leaves their loss in the gain.
         """
-        status = traced.status
-        opacity = ~np.isin(traced.fate, np.array(UNCOVERED, dtype=np.uint8))
-        source: Image = np.array(traced.source, dtype=np.float32)
-        lit = status == Fate.THROUGH
-        unseen = (status == Fate.NO_IMAGE) & opacity
-        if unseen.any():  # the lens model cannot say which pixel it is, but outside the image it is
-            source[unseen] = _outside(traced, unseen)
-            lit |= unseen
-        with np.errstate(invalid="ignore", divide="ignore"):
-            gain: Image = np.where(lit & opacity, traced.transmittance / clear, 0).astype(np.float32)
-        lost = ~(lit & np.isfinite(source).all(-1) & np.isfinite(gain))
-        source[lost] = 0
-        gain[lost] = 0
-        covered: Image = opacity.astype(np.float32)
-        return cls(rows, columns, source, gain, covered, density)
+        return cls(rows, columns, *answers(traced, clear), density)
 
     def at(self, depth: float) -> Patch:
         """The same drops before a plane at another depth, metres, without tracing; needs `keep` of `trace`."""
@@ -141,9 +127,10 @@ class Patch:
             raise ValueError(f"{self.opacity.shape} samples do not divide into {pixels} x {pixels}")
 
         def mean(values: Array) -> Image:
-            blocks = values.reshape(shape[0], pixels, shape[1], pixels, *values.shape[2:])
-            averaged: Image = blocks.mean((1, 3), dtype=np.float32)
-            return averaged
+            if not values.size:
+                return values.reshape(*shape, *values.shape[2:])
+            averaged: Image = cv2.resize(values, shape[::-1], interpolation=cv2.INTER_AREA)  # of whole blocks
+            return averaged.reshape(*shape, *values.shape[2:])
 
         weight = self.gain * self.opacity
         opacity, light = mean(self.opacity), mean(weight)
@@ -187,6 +174,25 @@ class Patch:
         found = found.reshape(*at.shape[:2], *image.shape[2:])
         colour: Image = cv2.multiply(found, like(self.gain * self.opacity, found), dtype=cv2.CV_32F)
         return colour.reshape(found.shape), self.opacity
+
+
+def answers(traced: Trace, clear: Array | float = 1.0) -> tuple[Array, Array, Array]:
+    """Source, gain and opacity of a trace's samples, as a `Patch` has them; see `Patch.of_trace`."""
+    status = traced.status
+    opacity = ~np.isin(traced.fate, np.array(UNCOVERED, dtype=np.uint8))
+    source: Image = np.array(traced.source, dtype=np.float32)
+    lit = status == Fate.THROUGH
+    unseen = (status == Fate.NO_IMAGE) & opacity
+    if unseen.any():  # the lens model cannot say which pixel it is, but outside the image it is
+        source[unseen] = _outside(traced, unseen)
+        lit |= unseen
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gain: Image = np.where(lit & opacity, traced.transmittance / clear, 0).astype(np.float32)
+    lost = ~(lit & np.isfinite(source).all(-1) & np.isfinite(gain))
+    source[lost] = 0
+    gain[lost] = 0
+    covered: Image = opacity.astype(np.float32)
+    return source, gain, covered
 
 
 def sample_shape(rows: slice, columns: slice, density: float) -> tuple[int, int]:
@@ -236,14 +242,16 @@ def folded(source: Array, size: tuple[int, int], border: str = "mirror") -> Arra
     Pixels any distance outside are reflected about the centres of the outermost pixels as often as it takes, or moved
     to the nearest edge. Bilinear values are those of an image so continued.
     """
-    if border not in BORDERS:
-        raise ValueError(f"border {border!r} is unknown; expected {' or '.join(map(repr, BORDERS))}")
-    last = np.array([size[0] - 1, size[1] - 1], dtype=np.float32)
-    return folded_along(source, last, border)
+    inside: Image = np.empty(source.shape, dtype=np.float32)
+    for axis in (0, 1):  # one at a time: numpy is slow along an axis of 2
+        inside[..., axis] = folded_along(np.ascontiguousarray(source[..., axis]), size[axis] - 1, border)
+    return inside
 
 
 def folded_along(values: Array, last: Any, border: str = "mirror") -> Array:
     """One coordinate of source pixels, any shape, brought between 0 and `last`, the outermost pixel's; see `folded`."""
+    if border not in BORDERS:
+        raise ValueError(f"border {border!r} is unknown; expected {' or '.join(map(repr, BORDERS))}")
     end = np.asarray(last, dtype=np.float32)
     if border == "mirror":
         period = np.maximum(2 * end, np.float32(1))
@@ -324,4 +332,4 @@ def _text(part: slice) -> str:
     return f"{part.start}..{part.stop}"
 
 
-__all__ = ["BORDERS", "Patch", "folded", "ratio", "resampled", "sample_pixels", "sample_shape"]
+__all__ = ["BORDERS", "Patch", "answers", "folded", "ratio", "resampled", "sample_pixels", "sample_shape"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,9 +13,11 @@ from rainstereo.chamber import Chamber
 from rainstereo.defocus import SAME, DefocusedPatch, apparent_distances, defocused
 from rainstereo.droplet import Drop
 from rainstereo.layer import Layer
-from rainstereo.patch import resampled, sample_pixels
+from rainstereo.patch import Patch, resampled, sample_pixels
 from rainstereo.thin_lens import ThinLens
 from rainstereo.types import Array, Image, Mask
+
+from .retraced import Traced, retraced
 
 Window = tuple[slice, slice]
 SHARPEST = 1.0  # pixels; drops of smaller discs are rendered as through a pinhole
@@ -28,12 +30,15 @@ class BlurredLayer:
     patch: in pixels of the camera's image, cut at its edges when it is made.
 
     lookup: the same in pixels of the images that are given, which may be wider.
+
+    traced: the drops' samples, for the next frame.
     """
 
     drops: tuple[Drop, ...]
     patch: DefocusedPatch
     lookup: DefocusedPatch
     shift: tuple[int, int]
+    traced: Traced | None = None
 
     @classmethod
     def of(
@@ -46,17 +51,29 @@ class BlurredLayer:
         size: tuple[int, int],
         shift: tuple[int, int],
         border: str,
+        before: Traced | None = None,
     ) -> BlurredLayer:
-        """Trace drops. size: (width, height) of the images that are given; shift: x, y of the camera's in them."""
-        made = defocused(drops, camera, chamber, lens, depth, border=border)
+        """Trace drops. size: (width, height) of the images that are given; shift: x, y of the camera's in them.
+
+        before: samples of an earlier frame of the same; what has not changed since is not traced again.
+        """
+        traced: list[Traced] = []
+
+        def trace(window: Window, density: float) -> Patch:
+            patch = retraced(drops, camera, chamber, depth, window, density, before)
+            traced.append(Traced(drops, patch))
+            return patch
+
+        made = defocused(drops, camera, chamber, lens, depth, border=border, tracer=trace)
+        kept = traced[0] if traced else None
         if shift == (0, 0) and size == camera.size:
-            return cls(drops, made, made, shift)
+            return cls(drops, made, made, shift, kept)
         x, y = shift
         rows = slice(made.patch.rows.start + y, made.patch.rows.stop + y)
         columns = slice(made.patch.columns.start + x, made.patch.columns.stop + x)
         source = made.patch.source + np.array(shift, dtype=np.float32)
         moved = replace(made.patch, rows=rows, columns=columns, source=source, kept=None)
-        return cls(drops, made, replace(made, patch=moved, size=size), shift)
+        return cls(drops, made, replace(made, patch=moved, size=size), shift, kept)
 
     def paste(self, scene: Image, out: Image) -> None:
         """Put the layer over a frame. scene: the clear image, as given."""
@@ -110,6 +127,18 @@ class BlurredLayer:
             return *window, np.zeros((0, 0), np.bool_)
         unknown: Image = self.lookup.patch.unknown(self.lookup.size).astype(np.float32)
         return *window, self._fine(unknown) > 0
+
+
+def nearest(drops: Sequence[Drop], layers: Iterable[BlurredLayer]) -> Traced | None:
+    """The samples of that layer, of the same face, which shares most drops with these."""
+    everyone = set(drops)
+    shared = [
+        (len(everyone.intersection(layer.drops)), layer.traced)
+        for layer in layers
+        if layer.traced is not None and (layer.drops[0].panel, layer.drops[0].face) == (drops[0].panel, drops[0].face)
+    ]
+    most, traced = max(shared, key=lambda pair: pair[0], default=(0, None))
+    return traced if most else None
 
 
 def by_disc(

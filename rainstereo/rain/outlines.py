@@ -14,7 +14,7 @@ from rainstereo.chamber import Chamber
 from rainstereo.droplet import Drop
 from rainstereo.panel_plane import PanelFrame
 from rainstereo.refraction import project
-from rainstereo.types import Array, Indices
+from rainstereo.types import Array, Indices, Mask
 
 from .contacts import clusters, touching
 
@@ -22,6 +22,7 @@ SEEN, AROUND, HEIGHTS = 5, 16, 2
 """Points of a circle whose image is found, and those, of a polygon around it, that are interpolated between them: along
 the image of a small circle, with two frequencies, what is left out is of the third order in its size."""
 BLOCK = 4096  # drops whose circles are found at a time
+ASIDE = 1.5  # times as far as a drop's top appears from its foot; an image may stretch to one side
 MARGIN = 2.5
 """Pixels around a drop that are its own too: a ring without any of it, so that two groups share no pixel."""
 
@@ -43,11 +44,28 @@ class Outlines:
         """The circles of drops, as a pinhole at the camera's centre sees them."""
         nowhere = np.zeros(0)
         blocks = (drops[first : first + BLOCK] for first in range(0, len(drops), BLOCK))
-        parts = [cls._of_some(some, camera, chamber) for some in blocks]
+        parts = [cls._of_some(some, camera, chamber)._shown() for some in blocks]
         return cls.joined([cls(nowhere, nowhere, nowhere, camera.size), *parts])
 
     @classmethod
-    def _of_some(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> Outlines:
+    def whole(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> Outlines:
+        """The circles of drops, also beyond the image, wide enough for all rays that may be taken for a drop's.
+
+        `drop_grid` takes rays for a drop's that stand no farther away than they move over its height, to any side.
+        """
+        nowhere = np.zeros(0)
+        blocks = (drops[first : first + BLOCK] for first in range(0, len(drops), BLOCK))
+        parts = [cls._of_some(some, camera, chamber, aside=ASIDE) for some in blocks]
+        return cls.joined([cls(nowhere, nowhere, nowhere, camera.size), *parts])
+
+    def _shown(self) -> Outlines:
+        """With no circle where the image does not show it."""
+        middle, size = np.stack([self.x, self.y], -1), np.array(self.size)
+        off = np.hypot(*(middle - np.minimum(np.maximum(middle, -0.5), size - 0.5)).T)
+        return Outlines(self.x, self.y, np.where(off < self.radius, self.radius, 0.0), self.size)
+
+    @classmethod
+    def _of_some(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber, aside: float = 0.0) -> Outlines:
         frame = PanelFrame.of(chamber)
         phi = 2 * math.pi / SEEN * np.arange(SEEN)
         ring = np.stack([np.cos(phi), np.sin(phi)], -1)
@@ -62,12 +80,13 @@ class Outlines:
         u, v = rings.reshape(2, len(drops), -1)
         middle = np.stack([0.5 * (u.min(1) + u.max(1)), 0.5 * (v.min(1) + v.max(1))], -1)
         radius = np.sqrt((np.square(u - middle[:, :1]) + np.square(v - middle[:, 1:])).max(1)) + MARGIN
+        if aside:
+            moved = np.hypot(u[:, :AROUND] - u[:, -AROUND:], v[:, :AROUND] - v[:, -AROUND:])
+            radius = radius + aside * moved.max(1)
         seen = np.isfinite(radius)
         size = np.array(camera.size)
         middle = np.where(seen[:, None], middle, size / 2)
-        radius = np.where(seen, radius, np.inf)
-        off = np.hypot(*(middle - np.minimum(np.maximum(middle, -0.5), size - 0.5)).T)
-        return cls(middle[:, 0], middle[:, 1], np.where(off < radius, radius, 0.0), camera.size)
+        return cls(middle[:, 0], middle[:, 1], np.where(seen, radius, np.inf), camera.size)
 
     def groups(self) -> list[Indices]:
         """Numbers of the drops that must be traced together: of each chain of circles that meet; none of the unseen."""
@@ -125,6 +144,18 @@ class Outlines:
         over, total = (np.ravel(sums.reshape(height, -1)[:, :width]) for sums in (over, total))
         pixels = np.flatnonzero(over)
         return pixels, (total[pixels] / over[pixels]).astype(np.intp)
+
+    def covered(self) -> Mask:
+        """Pixels of the image, (H, W), in any circle."""
+        width, height = self.size
+        edges: Any = np.zeros(height * (width + 1), dtype=np.int32)
+        for first in range(0, len(self.x), BLOCK):
+            _, row, start, stop = self.take(np.arange(len(self.x))[first : first + BLOCK])._lines()
+            for sign, at in ((1, start), (-1, stop)):
+                np.add.at(edges, row * (width + 1) + at, np.int32(sign))
+        edges = edges.reshape(height, width + 1)
+        inside: Mask = np.cumsum(edges, axis=1, dtype=np.int32, out=edges)[:, :width] > 0
+        return inside
 
     def _lines(self) -> tuple[Indices, Indices, Indices, Indices]:
         """Of each row of pixels of each circle the drop, the row, its first column and the one after its last."""

@@ -25,7 +25,7 @@ from rainstereo.thin_lens import ThinLens
 from rainstereo.types import Array, Image, Indices, Mask
 
 from . import drop_list, linear_light
-from .blurred import BlurredLayer, by_disc
+from .blurred import BlurredLayer, by_disc, nearest
 from .cap_tier import OWN, CapTiers, DropTier
 from .drops import Drops
 from .looks import Looks
@@ -143,16 +143,21 @@ class Renderer:
     def split(
         self, drops: Sequence[Drop], known: Mapping[Key, BlurredLayer] | None = None
     ) -> tuple[Sequence[Drop], list[BlurredLayer]]:
-        """The sharp drops, and layers of the others, the farthest first; those in `known` are not traced again."""
+        """The sharp drops, and layers of the others, the farthest first.
+
+        Layers in `known` are taken as they are; of others, what is in those is not traced again.
+        """
         if self.lens is None or math.isinf(self.lens.f_number):
             return drops, []
         place = (self.scene_size, self.shift, self.fold)
         sharp, blurred = by_disc(drops, self.camera, self.chamber, self.lens)
-        known = known or {}
-        layers = [
-            known.get(tuple(some)) or BlurredLayer.of(some, self.camera, self.chamber, self.lens, self.depth, *place)
-            for some in blurred
-        ]
+        known, layers = known or {}, list[BlurredLayer]()
+        for some in blurred:
+            before = None if some in known else nearest(some, known.values())
+            layers.append(
+                known.get(some)
+                or BlurredLayer.of(some, self.camera, self.chamber, self.lens, self.depth, *place, before)
+            )
         return sharp, layers
 
     def groups(self, drops: Sequence[Drop]) -> list[Group]:

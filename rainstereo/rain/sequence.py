@@ -40,7 +40,7 @@ class Sequence:
     """Plans of frame after frame. Each is, bit for bit, what `Renderer.plan` gives for its drops.
 
     What is kept are the tables of groups of drops that are equal to a group of the frame before: caps of equal numbers,
-    or the very same shapes. A blurred layer is kept while all its drops are.
+    or the very same shapes. Of blurred layers all samples that no changed drop has to do with are kept (`retraced`).
     """
 
     def __init__(self, renderer: Renderer, motion: Motion | None = None) -> None:
@@ -96,6 +96,7 @@ class PaneShapes:
 
     def __init__(self) -> None:
         self._known: dict[bytes, list[Drop]] = {}
+        self._trails = TrailShapes()
 
     def of(self, state: PaneState) -> list[Drop]:
         """Bodies of drops, and trails as rows of pieces. Drops too steep to merge stay caps."""
@@ -105,12 +106,22 @@ class PaneShapes:
             key = _bytes(members.x, members.y, members.radius, members.contact_angle)
             self._known[key] = known[key] if key in known else _body(members)
             found += self._known[key]
+        return found + self._trails.of(state)
+
+
+class TrailShapes:
+    """The trails on a pane as rows of pieces: the very same pieces while a trail does not change."""
+
+    def __init__(self) -> None:
+        self._known: dict[bytes, list[Drop]] = {}
+
+    def of(self, state: PaneState) -> list[Drop]:
+        """The pieces of all trails."""
+        known, found = self._known, list[Drop]()
+        self._known = {}
         for trail in state.trails:
             key = _bytes(trail.points, trail.half_width, np.array(trail.contact_angle))
-            if key in known:
-                self._known[key] = known[key]
-            else:
-                self._known[key] = list(trail.streak(**state.drops.place).pieces())
+            self._known[key] = known[key] if key in known else list(trail.streak(**state.drops.place).pieces())
             found += self._known[key]
         return found
 
@@ -138,4 +149,4 @@ def _bytes(*columns: Array) -> bytes:
     return b"".join(column.tobytes() for column in columns)
 
 
-__all__ = ["PaneShapes", "Sequence", "joined_shapes"]
+__all__ = ["PaneShapes", "Sequence", "TrailShapes", "joined_shapes"]

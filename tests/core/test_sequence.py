@@ -19,6 +19,7 @@ from rainstereo.rain.drops import Drops
 from rainstereo.rain.motion import Motion
 from rainstereo.rain.pane import Pane
 from rainstereo.rain.render import Plan, Renderer
+from rainstereo.rain.sequence import TrailShapes
 from rainstereo.thin_lens import ThinLens
 
 CAMERA = Camera.pinhole(800, 800, 199.5, 149.5, 400, 300)
@@ -141,6 +142,23 @@ def test_motion():
     late = renderer.sequence(running()).at(0.3)
     np.testing.assert_array_equal(late.apply(image), frames[-1])
     assert_same(late, renderer.plan(late.drops))
+
+
+def test_trails_that_rest_stay_the_same_shapes():
+    """Those of a trail that has not changed are the very same, others are made anew; one frame's are kept."""
+    state, shapes = running().at(0.2), TrailShapes()
+    assert len(state.trails) >= 2
+    wider = replace(state.trails[0], half_width=1.01 * state.trails[0].half_width)
+    changed = replace(state, trails=(wider, *state.trails[1:]))
+    before, after = shapes.of(state), shapes.of(changed)
+    fresh = [list(trail.streak(**state.drops.place).pieces()) for trail in changed.trails]
+    assert len({id(piece) for piece in after} & {id(piece) for piece in before}) == sum(map(len, fresh[1:])) > 0
+    assert [(piece.centre, piece.reach, piece.volume) for piece in after] == [
+        (piece.centre, piece.reach, piece.volume) for pieces in fresh for piece in pieces
+    ]
+    assert all(a is b for a, b in zip(after, shapes.of(changed), strict=True))
+    shapes.of(replace(state, trails=()))
+    assert not {id(piece) for piece in after} & {id(piece) for piece in shapes.of(changed)}
 
 
 def test_without_motion_there_are_no_times():
