@@ -17,8 +17,9 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from rainstereo import imagefile, similarity
+from rainstereo import imagefile
 from rainstereo.apps.rain_sources import Label, Source
 from rainstereo.apps.run_record import write_atomically
 from rainstereo.rain import drop_list
@@ -28,10 +29,12 @@ from rainstereo.types import Image, Mask
 
 NOTES = ".rain"
 PROTOCOL = (
-    "By scikit-image's formulas, before encoding, on all channels as stored (BGR order does not matter), data_range "
-    "255 or 65535; SSIM with its 7 x 7 uniform window, mean of the channels"
+    "scikit-image, before encoding, on all channels as stored (BGR order does not matter), data_range 255 or 65535; "
+    "SSIM with its 7 x 7 uniform window, mean of the channels"
 )
 OPAQUE = 0.5
+SMALLEST = 7
+"""Pixels along a side, for SSIM's window."""
 Note = dict[str, Any]
 
 
@@ -140,12 +143,15 @@ def masks(plan: Plan) -> Image:
 
 def measured(clear: Image, rainy: Image, ssim: bool) -> Note:
     """PSNR, dB, and SSIM of a rainy image; see `PROTOCOL`. PSNR None: nothing differs. SSIM None: not asked for."""
-    psnr = similarity.psnr(clear, rainy)
-    value = similarity.ssim(clear, rainy) if ssim and min(clear.shape[:2]) >= similarity.WINDOW else None
-    return {
-        "psnr": round(psnr, 4) if math.isfinite(psnr) else None,
-        "ssim": None if value is None else round(value, 5),
-    }
+    most = np.iinfo(clear.dtype).max
+    psnr = None
+    if not np.array_equal(clear, rainy):
+        psnr = round(float(peak_signal_noise_ratio(clear, rainy, data_range=most)), 4)  # type: ignore[no-untyped-call]
+    if not ssim or min(clear.shape[:2]) < SMALLEST:
+        return {"psnr": psnr, "ssim": None}
+    axis = -1 if clear.ndim == 3 else None
+    value = structural_similarity(clear, rainy, data_range=most, channel_axis=axis)  # type: ignore[no-untyped-call]
+    return {"psnr": psnr, "ssim": round(float(value), 5) if math.isfinite(float(value)) else None}
 
 
 def _write(folder: Path, name: str, data: bytes) -> str:
