@@ -130,21 +130,24 @@ def test_two_equal_images_show_no_drop(clear: Image) -> None:
 # -- the fit -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("cover", "f_number", "scale", "gain_off"),
-    [(0.2, 4.0, 1.0, 0.05), pytest.param(0.4, 2.5, 1.4, 0.13, marks=pytest.mark.slow)],
+    ("cover", "f_number", "scale", "gain_off", "seeds"),
+    [(0.2, 4.0, 1.0, 0.05, (11, 12, 13)), (0.4, 2.5, 1.4, 0.13, (11,))],
 )
 def test_cover_size_and_blur_of_known_rain_are_found(
-    clear: Image, cover: float, f_number: float, scale: float, gain_off: float
+    clear: Image, cover: float, f_number: float, scale: float, gain_off: float, seeds: tuple[int, ...]
 ) -> None:
+    """Each fit draws other drops of the law, about a hundred: where they are fewest, the mean of several is compared."""
     truth = known(cover, f_number, scale)
     scene = Scene.of(rainy(clear, truth, seed=5), clear, "known")
     assert scene.shift == (0, 0)
     assert scene.exposure.gain == pytest.approx(np.full(3, 0.85), abs=gain_off)
-    found = fit(scene, BASE, seed=11)
-    assert found.worst < 0.15
-    assert found.f_number == pytest.approx(f_number, rel=0.1)
-    assert found.scale == pytest.approx(scale, rel=0.1)
+    fits = [fit(scene, BASE, seed=seed) for seed in seeds]
+    found = fits[0]
+    assert max(each.worst for each in fits) < 0.15
+    assert np.mean([each.f_number for each in fits]) == pytest.approx(f_number, rel=0.1)
+    assert np.mean([each.scale for each in fits]) == pytest.approx(scale, rel=0.1)
     # other drops of the same law, some 100 of them: the shares that both really hide are compared
     plan, _ = Rain(truth, 5).plan(clear, "truth")
     hidden = float((plan.opacity > 0.5).mean())
