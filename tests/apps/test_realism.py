@@ -138,7 +138,7 @@ def test_two_equal_images_show_no_drop(clear: Image) -> None:
 def test_cover_size_and_blur_of_known_rain_are_found(
     clear: Image, cover: float, f_number: float, scale: float, gain_off: float, seeds: tuple[int, ...]
 ) -> None:
-    """Each fit draws other drops of the law, about a hundred: where they are fewest, the mean of several is compared."""
+    """Each fit draws other drops of the law, about a hundred: where these are fewest, several are compared."""
     truth = known(cover, f_number, scale)
     scene = Scene.of(rainy(clear, truth, seed=5), clear, "known")
     assert scene.shift == (0, 0)
