@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 
 from .compile import compiled, inlined
-from .layout import COLUMNS, QUARTERS, ROWS
+from .halves import MADE, columns_of_quads, quarters_of_quads, quarters_of_three
+from .layout import COLUMNS, PACKED, QUARTERS, ROWS
 
 U, Q = np.uint64, np.uint32
 EVEN = Q(0x00FF00FF)
 """Every other byte: the rest of each 16 bits has room for sums."""
 EACH = Q(0x00010001)
 BYTE, ONE, TWO = Q(8), Q(1), Q(2)
+EIGHT, FOUR = U(MADE), U(MADE // 2)
 
 
 @inlined
@@ -43,6 +45,33 @@ def pack_some(values: Any, rows: Any, quads: Any) -> None:
         quads[i] = quad_of(values, U(rows[i]))
 
 
+@compiled
+def halve(image: Any, up: Any, quads: Any) -> None:
+    """Write quads, (n,), of means over 2 x 2 pixels of bytes, (H, W, C), row by row; up: whether halves are rounded up.
+
+    An odd last column or row is its own pair.
+    """
+    height, width, channels = U(image.shape[0]), U(image.shape[1]), U(image.shape[2])
+    values, pitch, more, made = image.reshape(-1), width * channels, Q(2) if up else Q(1), U(0)
+    for i in range(U(0), height, U(2)):
+        above, done = i * pitch, U(0)
+        below = above + pitch if i + U(1) < height else above
+        if channels == PACKED:
+            while done + FOUR <= width // U(2):
+                at = (done + done) * channels
+                quarters_of_three(values, above + at, below + at, quads, made + done, more)
+                done += FOUR
+        for j in range(done, (width + U(1)) // U(2)):
+            left, right = (j + j) * channels, min(j + j + U(1), width - U(1)) * channels
+            quad = Q(0)
+            for channel in range(channels):
+                one, other = Q(values[above + left + channel]), Q(values[above + right + channel])
+                low = Q(values[below + left + channel]) + Q(values[below + right + channel])
+                quad |= ((one + other + low + more) >> TWO) << Q(BYTE * Q(channel))
+            quads[made + j] = quad
+        made += (width + U(1)) // U(2)
+
+
 @inlined
 def mean_of_two(a: Any, b: Any, more: Any) -> Any:
     """Byte by byte; more: what is added to each sum before it is cut off."""
@@ -60,8 +89,8 @@ def mean_of_four(a: Any, b: Any, c: Any, d: Any, more: Any) -> Any:
 
 
 @compiled
-def average(quads: Any, copies: Any) -> None:
-    """Make copies of others, in turn, all in `quads`, (N,).
+def average(quads: Any, target: Any, copies: Any) -> None:
+    """Make copies of others, (N,), in turn, in `target`, (M,), which may be the same.
 
     copies: (n, 6) int64: how (`QUARTERS`, `COLUMNS`, `ROWS`), the place of the first texel of what a copy is made of,
     its width and height, the place of the copy's own first texel, and whether halves are rounded up. An odd last column
@@ -70,28 +99,37 @@ def average(quads: Any, copies: Any) -> None:
     for each in range(U(len(copies))):
         how, width, height = copies[each, U(0)], U(copies[each, U(2)]), U(copies[each, U(3)])
         given, made = U(copies[each, U(1)]), U(copies[each, U(4)])
-        of_two = EACH if copies[each, U(5)] else Q(0)
-        of_four = of_two + EACH
+        up = Q(1) if copies[each, U(5)] else Q(0)
+        of_two, of_four = up * EACH, up * EACH + EACH
         across = U(1) if how == ROWS else U(2)
         down = U(1) if how == COLUMNS else U(2)
         pairs = width // across
         for i in range(U(0), height, down):
-            start = given + i * width
-            above, below = quads[start : start + width], quads[start : start + width]
-            if down == U(2) and i + U(1) < height:
-                below = quads[start + width : start + width + width]
-            line = quads[made : made + pairs]
+            above, done = given + i * width, U(0)
+            below = above + width if down == U(2) and i + U(1) < height else above
             if how == QUARTERS:
-                for j in range(pairs):
-                    left, right = j + j, j + j + U(1)
-                    line[j] = mean_of_four(above[left], above[right], below[left], below[right], of_four)
+                while done + EIGHT <= pairs:
+                    quarters_of_quads(quads, above + done + done, below + done + done, target, made + done, up + Q(1))
+                    done += EIGHT
+                for j in range(done, pairs):
+                    a, b = above + j + j, below + j + j
+                    target[made + j] = mean_of_four(quads[a], quads[a + U(1)], quads[b], quads[b + U(1)], of_four)
             elif how == COLUMNS:
-                for j in range(pairs):
-                    line[j] = mean_of_two(above[j + j], above[j + j + U(1)], of_two)
+                while done + EIGHT <= pairs:
+                    columns_of_quads(quads, above + done + done, above, target, made + done, up)
+                    done += EIGHT
+                for j in range(done, pairs):
+                    a = above + j + j
+                    target[made + j] = mean_of_two(quads[a], quads[a + U(1)], of_two)
             else:
+                one, other, line = (
+                    quads[above : above + width],
+                    quads[below : below + width],
+                    target[made : made + pairs],
+                )
                 for j in range(pairs):
-                    line[j] = mean_of_two(above[j], below[j], of_two)
+                    line[j] = mean_of_two(one[j], other[j], of_two)
             made += pairs
             if width % across:
-                quads[made] = mean_of_two(above[width - U(1)], below[width - U(1)], of_two)
+                target[made] = mean_of_two(quads[above + width - U(1)], quads[below + width - U(1)], of_two)
                 made += U(1)

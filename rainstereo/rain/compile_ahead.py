@@ -63,7 +63,10 @@ def compile_here(lasting: bool) -> None:
 
 
 def _draw() -> None:
-    texels, weights = np.arange(4, dtype=np.int32), np.full(4, 256, dtype=np.int16)
+    texels = np.append(np.arange(4), SIDE**2 + np.arange(12)).astype(
+        np.int32
+    )  # some pixels, and most of the next level
+    weights = np.full(len(texels), 64, dtype=np.int16)
     one: Indices = np.zeros(1, dtype=np.intp)
     taps = Taps(texels, weights, one + len(texels), np.zeros(1))
     table = Lookups.of(one, one, taps, np.zeros(1), np.zeros((1, 2)), np.zeros(1, dtype=np.bool_)).ordered(SIDE)

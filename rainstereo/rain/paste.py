@@ -89,27 +89,29 @@ class Paste:
         if not self.tables:
             return
         target, beneath = _flat(out), _flat(below)
+        if out.dtype == np.uint8 and compiled.available():
+            self._quads(scene, beneath, target)
+            return
         levels = self._needed.levels(scene)
         if out.dtype != np.uint8:
             self._numbers(levels, beneath, target)
-        elif compiled.available():
-            self._quads(levels, beneath, target)
         else:
             for first in range(0, target.shape[1], PACKED):
                 self._words(levels, beneath, target, slice(first, min(first + PACKED, target.shape[1])))
 
-    def _quads(self, levels: list[Image], below: Image, out: Image) -> None:
+    def _quads(self, scene: Image, below: Image, out: Image) -> None:
         """Sums of bytes in compiled loops, all channels together."""
         from rainstereo.compiled.quads import pack_some
         from rainstereo.compiled.sums import sum_quads
 
         end = self._needed.ends[-1]
+        last = end + len(self.soft)
         try:
             row = self._spare.pop()
         except IndexError:
-            row = np.empty(end + len(self.soft), dtype=np.uint32)
-        self._needed.put_quads(levels, row[:end])
-        pack_some(below, self.soft, row[end:])
+            row = np.empty(last + self._needed.fine, dtype=np.uint32)
+        self._needed.put_quads(scene, row[:end], row[last:])
+        pack_some(below, self.soft, row[end:last])
         for some in self._eights:
             sum_quads(out.reshape(-1), out.shape[1], row, SHIFT, some.pixels, some.most, some.taps, some.roundings)
         self._spare.append(row)

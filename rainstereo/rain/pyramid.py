@@ -17,6 +17,8 @@ from rainstereo.types import Array, Image
 
 SMALLEST = 4  # pixels along the shorter side
 BIAS = 0.125  # gray levels by which OpenCV's mean of four whole numbers is too large: it rounds halves up
+ROUNDED = (0, 1, 3, 4)
+"""Numbers of channels for which it does; for others it rounds some halves down."""
 BIAS_OF_PAIRS = 0.25  # by which means of two bytes are too small, halves rounded down
 PAIRED = 2  # level from which there are copies that are wider than high: finer ones are dear to make
 LONG = 2  # times that they are twice as wide
@@ -90,6 +92,8 @@ def half(image: Image, up: bool = True) -> Image:
     """Means over 2 x 2 pixels of an image, (H, W[, C]) uint8, uint16 or float32; whether halves are rounded up."""
     if not up and image.dtype.kind == "u":
         return ~half(~image)
+    if image.ndim == 3 and image.shape[2] not in ROUNDED and image.dtype.kind == "u":
+        return np.stack([half(channel) for channel in np.moveaxis(image, 2, 0)], -1)
     height, width = image.shape[:2]
     if height % 2 or width % 2:
         image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE).reshape(

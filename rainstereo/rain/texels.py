@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rainstereo.compiled.layout import COLUMNS, QUARTERS, ROWS
+from rainstereo.compiled.layout import COLUMNS, PACKED, QUARTERS, ROWS
 from rainstereo.types import Image, Mask
 
 from . import words
@@ -76,6 +76,11 @@ class Texels:
         """Where the row's texels of each level that are picked begin, and where the last end: the row's length."""
         return [self.whole + n for n in np.cumsum([0, *(len(rows) for rows in self.picked)]).tolist()]
 
+    @property
+    def fine(self) -> int:
+        """Quads of levels that are made on the way and do not stand in the row."""
+        return sum(copy.width * copy.height for copy in copies(self.size)[1 : len(self.picked)])
+
     def places(self) -> Any:
         """(N,) uint32: where in the row each texel stands that is used."""
         found = np.zeros(self.starts[-1], dtype=np.uint32)
@@ -95,19 +100,34 @@ class Texels:
         """Write words of up to three channels of bytes, (n,) uint64."""
         self._put(levels, part, row, words.packed, words.mean)
 
-    def put_quads(self, levels: list[Image], row: Any) -> None:
-        """Write quads of up to four channels of bytes, (n,) uint32, in compiled loops."""
-        from rainstereo.compiled.quads import average, pack, pack_some
+    def put_quads(self, scene: Image, row: Any, fine: Any) -> None:
+        """Write quads of up to four channels of bytes, (n,) uint32, in compiled loops; fine: (`fine`,) to work in."""
+        from rainstereo.compiled.quads import average, halve, pack, pack_some
 
-        if self.whole:
-            base, quads = levels[-1], row[: len(levels[-1])]
-            if base.shape[1] == 3:
-                cv2.cvtColor(base[None], cv2.COLOR_BGR2BGRA, dst=quads.view(np.uint8).reshape(1, -1, 4))
+        image, every, own = scene.reshape(*scene.shape[:2], -1), copies(self.size), len(self.picked)
+        pixels, levels, used = image.reshape(-1, image.shape[2]), [row], 0
+        for k in range(1, own + (self.whole > 0)):
+            size = every[k].width * every[k].height
+            levels.append(row[:size] if k == own else fine[used : used + size])
+            used += size
+            if k == 1:
+                halve(image, every[k].up, levels[k])
             else:
-                pack(base, quads)
-            average(row, self.made)
-        for level, rows, (a, b) in zip(levels, self.picked, pairwise(self.ends), strict=False):
-            pack_some(level, rows, row[a:b])
+                how = QUARTERS, 0, every[k - 1].width, every[k - 1].height, 0, every[k].up
+                average(levels[k - 1], levels[k], np.array([how], dtype=np.int64))
+        if self.whole:
+            if not own and image.shape[2] == PACKED:
+                cv2.cvtColor(
+                    image, cv2.COLOR_BGR2BGRA, dst=row[: len(pixels)].view(np.uint8).reshape(*image.shape[:2], 4)
+                )
+            elif not own:
+                pack(pixels, row[: len(pixels)])
+            average(row, row, self.made)
+        for k, (rows, (a, b)) in enumerate(zip(self.picked, pairwise(self.ends), strict=False)):
+            if k == 0:
+                pack_some(pixels, rows, row[a:b])
+            else:
+                np.take(levels[k], rows, out=row[a:b], mode="clip")
 
     def put_numbers(self, levels: list[Image], row: Image) -> None:
         """Write values, (n, C) float32."""

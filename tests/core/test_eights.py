@@ -8,6 +8,7 @@ pytest.importorskip("numba", reason="numba is not installed (extra fast)")
 from rainstereo.compiled import quads
 from rainstereo.compiled.layout import COLUMNS, LONG_BITS, QUARTERS, ROWS, SHORT_BITS
 from rainstereo.compiled.sums import interleave, sum_quads
+from rainstereo.rain.pyramid import half
 
 SHIFT = 10
 
@@ -62,7 +63,7 @@ def test_sums_against_whole_numbers(rows, channels, kind, bits):
 
 @pytest.mark.parametrize("up", [False, True])
 @pytest.mark.parametrize("how", [QUARTERS, COLUMNS, ROWS])
-@pytest.mark.parametrize("size", [(16, 12), (13, 9), (1, 5)])
+@pytest.mark.parametrize("size", [(16, 12), (53, 9), (1, 5)])
 def test_means_of_quads(how, up, size):
     """Byte by byte, an odd last column or row being its own pair; halves go where they are to."""
     rng = np.random.default_rng(7)
@@ -72,10 +73,28 @@ def test_means_of_quads(how, up, size):
     wide, high = -(-width // across), -(-height // down)
     row = np.zeros(width * height + wide * high, dtype=np.uint32)
     quads.pack(image.reshape(-1, 4), row[: width * height])
-    quads.average(row, np.array([[how, 0, width, height, width * height, up]]))
+    quads.average(row, row, np.array([[how, 0, width, height, width * height, up]]))
     padded = np.pad(image, ((0, high * down - height), (0, wide * across - width), (0, 0)), mode="edge").astype(int)
     total = padded.reshape(high, down, wide, across, 4).sum((1, 3))
     count = across * down
     more = count // 2 if up else count // 2 - 1
     expected = (total + more) // count
     np.testing.assert_array_equal(row[width * height :].view(np.uint8).reshape(high, wide, 4), expected)
+
+
+@pytest.mark.parametrize("up", [False, True])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize("size", [(40, 12), (53, 9), (7, 1), (1, 5)])
+def test_halves_of_bytes(size, channels, up):
+    """Halves of an image, each channel in its byte and nothing in others; OpenCV's, and whole numbers in numpy."""
+    width, height = size
+    image = np.random.default_rng(8).integers(0, 256, (height, width, channels), dtype=np.uint8)
+    padded = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge").astype(int)
+    expected = (padded.reshape(-(-height // 2), 2, -(-width // 2), 2, channels).sum((1, 3)) + 1 + up) // 4
+    found = np.full(expected.shape[0] * expected.shape[1] + 1, 77, dtype=np.uint32)
+    quads.halve(image, up, found)
+    assert found[-1] == 77
+    shown = np.stack([(found[:-1] >> (8 * c)) & 255 for c in range(4)], -1).reshape(*expected.shape[:2], 4)
+    np.testing.assert_array_equal(shown[..., :channels], expected)
+    assert not shown[..., channels:].any()
+    np.testing.assert_array_equal(half(image, up), expected)

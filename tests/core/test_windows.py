@@ -154,7 +154,7 @@ def test_loops_compiled_ahead_are_those_that_draw(lasting, monkeypatch):
 
     loops = [pursuit.choose] if lasting else []
     loops += [orders.reorder, sums.interleave, sums.sum_quads, windows.places]
-    loops += [quads.pack, quads.pack_some, quads.average]
+    loops += [quads.pack, quads.pack_some, quads.average, quads.halve]
     renderer = Renderer(Camera.pinhole(400, 400, 101, 75, *SIZE), PANE, lasting=lasting)
     compile_ahead.cache_clear()
     compile_ahead(lasting)
