@@ -9,12 +9,9 @@ import numpy as np
 from .compile import compiled
 from .eights import four_channels, one_channel, three_channels, two_channels
 from .layout import LANES
-from .prefetch import to_write
 
 U = np.uint64
 EIGHT = U(LANES)
-SOON = U(4)
-"""Groups of eight pixels that are fetched before they are written: they lie anywhere in the image."""
 
 
 @compiled
@@ -60,12 +57,10 @@ def sum_quads(
     (M,) uint32, M a multiple of 8. most, taps: of `interleave`. roundings: (M,) int32, units of weights, for every
     channel.
     """
-    unit, apart, end, tap = np.uint32(shift), U(channels), U(len(pixels)) - U(1), U(0)
+    unit, tap = np.uint32(shift), U(0)
     for eight in range(U(len(most))):
         row, first = eight * EIGHT, tap
         tap += U(most[eight]) * EIGHT
-        for lane in range(EIGHT):
-            to_write(out, U(pixels[min(row + SOON * EIGHT + lane, end)]) * apart)
         if channels == 1:
             one_channel(out, quads, unit, pixels, row, taps, first, tap, roundings)
         elif channels == 2:
