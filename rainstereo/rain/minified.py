@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 
@@ -26,6 +26,7 @@ from rainstereo.patch import LONGEST, Patch
 from rainstereo.trace import BLOCK, clear_transmittance, trace
 from rainstereo.types import Array, Image, Indices, Mask, Status
 
+from .far_caps import MOST, FarCaps
 from .free_memory import give_back
 from .lookups import JOINED, Lookups
 from .pursuit import Pursuit, forget
@@ -67,11 +68,18 @@ class Batch:
     which: Indices | None = None
     low: Array | float = -math.inf
     high: Array | float = math.inf
+    kept: dict[str, FarCaps | None] = field(default_factory=dict, repr=False)
 
     def near(self, first: int, last: int) -> Sequence[Drop]:
         """The drops that rows of the image, from the first to the last, can show."""
         seen = np.broadcast_to((self.low <= last) & (self.high >= first), len(self.drops))
         return [self.drops[i] for i in np.flatnonzero(seen).tolist()]
+
+    def far_caps(self, camera: Camera, chamber: Chamber, depth: float) -> FarCaps | None:
+        """The drops, ready to be traced by a loop in machine code, if it suits them."""
+        if "far_caps" not in self.kept:
+            self.kept["far_caps"] = FarCaps.of(self.drops, camera, chamber, depth)
+        return self.kept["far_caps"]
 
     def parts(self) -> list[Batch]:
         """The batch in pieces of about `TOGETHER` pixels, cut between drops, if it can be; nothing if it is empty."""
@@ -80,7 +88,7 @@ class Batch:
         starts = np.flatnonzero(np.diff(self.which, prepend=-1))
         cuts = starts[np.unique(starts // TOGETHER, return_index=True)[1]].tolist()
         pieces = [slice(a, b) for a, b in pairwise([*cuts, len(self.pixels)])]
-        return [Batch(self.drops, self.pixels[p], self.groups[p], self.which[p]) for p in pieces]
+        return [Batch(self.drops, self.pixels[p], self.groups[p], self.which[p], kept=self.kept) for p in pieces]
 
 
 def rays_along(tolerance: float) -> int:
@@ -196,6 +204,9 @@ class Minifier:
         """Side x side rays of pixels of a batch, some or all."""
         number = batch.pixels[rows]
         width = self.camera.width
+        caps = batch.far_caps(self.camera, self.chamber, self.depth) if side <= MOST else None
+        if caps is not None:
+            return caps.look(number, None if batch.which is None else batch.which[rows], side, self.clear[number])
         own: Image = np.stack([number % width, number // width], -1).astype(np.float32)
         along = ((np.arange(side) + 0.5) / side - 0.5).astype(np.float32)
         offsets = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)
