@@ -10,9 +10,9 @@ hides: of 8 x 8 that share is wrong by 0.013 or so, which is more gray levels th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 
 import cv2
@@ -29,6 +29,7 @@ from rainstereo.types import Array, Image, Indices, Mask, Status
 from .far_caps import MOST, FarCaps
 from .free_memory import give_back
 from .lookups import JOINED, Lookups
+from .ordered_threads import in_order
 from .pursuit import Pursuit, forget
 from .quadtree import Quadtree
 from .samples import Samples
@@ -173,14 +174,15 @@ class Minifier:
         for i, part in enumerate(parts):
             pending.append(part)
             if i == len(parts) - 1 or sum(len(some.pixels) for some in pending) >= TOGETHER:
-                yield from (table for table in self._of_some(pending) if len(table.pixels))
+                yield from (table for table in in_order(self._of_some(pending)) if len(table.pixels))
                 pending = []
 
-    def _of_some(self, batches: Sequence[Batch]) -> Iterator[Lookups]:
+    def _of_some(self, batches: Sequence[Batch]) -> Iterator[Callable[[], Lookups]]:
+        """What makes the tables, one by one."""
         side = rays_along(self.tolerance)
         if side == RAYS:
             for batch in batches:
-                yield self._look(batch, np.arange(len(batch.pixels)), self.traced(batch, side))
+                yield partial(self._of_rows, batch, np.arange(len(batch.pixels)), side)
             return
         kinds = [_kind(self.traced(batch, RAYS)) for batch in batches]
         ends = np.cumsum([len(kind) for kind in kinds])[:-1]
@@ -191,12 +193,14 @@ class Minifier:
             for some, more in ((~fine & (edge | (kind == LIT)), 1), (fine, OUTLINE)):
                 rows = np.flatnonzero(some)
                 for first in range(0, len(rows), CHUNK // more**2):
-                    part = rows[first : first + CHUNK // more**2]
-                    yield self._look(batch, part, self.traced(batch, more * side, part))
+                    yield partial(self._of_rows, batch, rows[first : first + CHUNK // more**2], more * side)
             dark = np.flatnonzero(~edge & (kind == DARK))
             for first in range(0, len(dark), TOGETHER):
                 part = dark[first : first + TOGETHER]
-                yield self._look(batch, part, _darkness(len(part)))
+                yield partial(self._look, batch, part, _darkness(len(part)))
+
+    def _of_rows(self, batch: Batch, rows: Indices, side: int) -> Lookups:
+        return self._look(batch, rows, self.traced(batch, side, rows))
 
     # -- tracing -------------------------------------------------------------------------------------------------------
 

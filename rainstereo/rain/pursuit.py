@@ -29,7 +29,7 @@ from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.types import Array, Image, Indices, Mask
 
 from .pyramid import LONG, Copy, copies, copy_starts, sizes
-from .quadtree import Quadtree, Steps, Taps, brought_in, ends_of, mixed, of_some, span_of, whole
+from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, whole
 
 HALVINGS = 3
 SHAPES = tuple((a, b) for a in range(HALVINGS + 1) for b in range(HALVINGS + 1) if abs(a - b) <= LONG)
@@ -95,9 +95,8 @@ class Pursuit:
         Pixels that see several places far apart get those of the tree.
         """
         given = x, y
-        x, y, steps = brought_in(x, y, weights, self.size, self.tree.border)
-        span = span_of(x, y, weights)
-        able = np.flatnonzero((self.level(span) >= 0) & ~self.tree.is_loose(span, steps, weights))
+        x, y, steps, span, loose = self.tree.placed(x, y, weights)
+        able = np.flatnonzero((self.level(span) >= 0) & ~loose)
         rest = np.ones(len(span), dtype=np.bool_)
         rest[able] = False
         tree = self.tree.taps(given[0][:, rest], given[1][:, rest], weights[:, rest])
