@@ -320,12 +320,16 @@ def _outside(traced: Trace, where: Mask) -> Array:
     """Pixels, (N, 2), far outside the image, towards where a camera without distortion would see the rays go."""
     depth = np.asarray(traced.depth)
     inverse = 1 / (depth[where][:, None] if depth.ndim else depth)
-    camera = traced.camera
+    return outside(traced.offset[where].astype(np.float64) + traced.slope[where] * inverse, traced.camera)
+
+
+def outside(straight: Array, camera: Camera) -> Array:
+    """Pixels, (N, 2), of a camera without distortion, that the lens model has no pixel for, moved far off the image."""
     centre = np.asarray(camera.intrinsics[2:4])
-    away = traced.offset[where].astype(np.float64) + traced.slope[where] * inverse - centre
+    away = straight.astype(np.float64) - centre
     length = np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
-    outside: Array = centre + away * (np.maximum(length, 2.0 * sum(camera.size)) / length)
-    return outside
+    found: Array = centre + away * (np.maximum(length, 2.0 * sum(camera.size)) / length)
+    return found
 
 
 def _text(part: slice) -> str:

@@ -84,7 +84,7 @@ class Trace:
             status = np.where(early, Fate.BEHIND, status).astype(np.uint8)
             source[early] = np.nan
         if self.camera.model != "LENSMODEL_PINHOLE":
-            source = _distorted(source, self.camera)
+            source = distorted(source, self.camera)
             unseen = (status == Fate.THROUGH) & np.isnan(source[..., 0])
             status = np.where(unseen, Fate.NO_IMAGE, status).astype(np.uint8)
         return replace(self, source=source, status=status, depth=depth)
@@ -312,7 +312,7 @@ def _inverse(depth: float | Array, pixels: Array) -> float | Array:
     return (1 / depths).astype(pixels.dtype) if depths.ndim else float(1 / depths)
 
 
-def _distorted(undistorted: Array, camera: Camera) -> Array:
+def distorted(undistorted: Array, camera: Camera) -> Array:
     """Pixels of the camera from those of the camera without distortion."""
     fx, fy, cx, cy = (float(c) for c in camera.intrinsics[:4])
     points = np.ones((*undistorted.shape[:-1], 3), dtype=undistorted.dtype)

@@ -13,9 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from rainstereo import compiled
+from rainstereo.camera import Camera
+from rainstereo.chamber import Chamber, Panel
 from rainstereo.compiled.layout import LONG_BITS, SHORT_BITS
+from rainstereo.droplet import SphericalCap
 from rainstereo.types import Indices
 
+from .far_caps import FarCaps
 from .free_memory import give_back
 from .lookups import Lookups
 from .paste import Paste
@@ -52,7 +56,11 @@ def compile_ahead(lasting: bool) -> None:
 
 
 def compile_here(lasting: bool) -> None:
-    """Find the taps of one pixel, order, pack and draw them."""
+    """Trace a pixel, find the taps of one, order, pack and draw them."""
+    camera, pane = Camera.pinhole(SPAN, SPAN, 0, 0, SIDE, SIDE), Chamber((0, 0, 1), 0.05, (Panel(0.002, 1.5),))
+    caps = FarCaps.of([SphericalCap((0, 0), 0.001, 0.5)], camera, pane, np.inf)
+    if caps is not None:
+        caps.look(np.zeros(1, dtype=np.intp), None, 1, np.ones(1, dtype=np.float32))
     along = np.linspace(0, SPAN, SIDE, dtype=np.float32)
     x, y = (at.reshape(-1, 1) for at in np.meshgrid(along, along))
     tree = Quadtree((SIDE * SPAN,) * 2, 17, 1.0)

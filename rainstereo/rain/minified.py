@@ -10,9 +10,9 @@ hides: of 8 x 8 that share is wrong by 0.013 or so, which is more gray levels th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from itertools import pairwise
 
 import cv2
@@ -26,8 +26,10 @@ from rainstereo.patch import LONGEST, Patch
 from rainstereo.trace import BLOCK, clear_transmittance, trace
 from rainstereo.types import Array, Image, Indices, Mask, Status
 
+from .far_caps import MOST, FarCaps
 from .free_memory import give_back
 from .lookups import JOINED, Lookups
+from .ordered_threads import in_order
 from .pursuit import Pursuit, forget
 from .quadtree import Quadtree
 from .samples import Samples
@@ -67,11 +69,18 @@ class Batch:
     which: Indices | None = None
     low: Array | float = -math.inf
     high: Array | float = math.inf
+    kept: dict[str, FarCaps | None] = field(default_factory=dict, repr=False)
 
     def near(self, first: int, last: int) -> Sequence[Drop]:
         """The drops that rows of the image, from the first to the last, can show."""
         seen = np.broadcast_to((self.low <= last) & (self.high >= first), len(self.drops))
         return [self.drops[i] for i in np.flatnonzero(seen).tolist()]
+
+    def far_caps(self, camera: Camera, chamber: Chamber, depth: float) -> FarCaps | None:
+        """The drops, ready to be traced by a loop in machine code, if it suits them."""
+        if "far_caps" not in self.kept:
+            self.kept["far_caps"] = FarCaps.of(self.drops, camera, chamber, depth)
+        return self.kept["far_caps"]
 
     def parts(self) -> list[Batch]:
         """The batch in pieces of about `TOGETHER` pixels, cut between drops, if it can be; nothing if it is empty."""
@@ -80,7 +89,7 @@ class Batch:
         starts = np.flatnonzero(np.diff(self.which, prepend=-1))
         cuts = starts[np.unique(starts // TOGETHER, return_index=True)[1]].tolist()
         pieces = [slice(a, b) for a, b in pairwise([*cuts, len(self.pixels)])]
-        return [Batch(self.drops, self.pixels[p], self.groups[p], self.which[p]) for p in pieces]
+        return [Batch(self.drops, self.pixels[p], self.groups[p], self.which[p], kept=self.kept) for p in pieces]
 
 
 def rays_along(tolerance: float) -> int:
@@ -165,14 +174,15 @@ class Minifier:
         for i, part in enumerate(parts):
             pending.append(part)
             if i == len(parts) - 1 or sum(len(some.pixels) for some in pending) >= TOGETHER:
-                yield from (table for table in self._of_some(pending) if len(table.pixels))
+                yield from (table for table in in_order(self._of_some(pending)) if len(table.pixels))
                 pending = []
 
-    def _of_some(self, batches: Sequence[Batch]) -> Iterator[Lookups]:
+    def _of_some(self, batches: Sequence[Batch]) -> Iterator[Callable[[], Lookups]]:
+        """What makes the tables, one by one."""
         side = rays_along(self.tolerance)
         if side == RAYS:
             for batch in batches:
-                yield self._look(batch, np.arange(len(batch.pixels)), self.traced(batch, side))
+                yield partial(self._of_rows, batch, np.arange(len(batch.pixels)), side)
             return
         kinds = [_kind(self.traced(batch, RAYS)) for batch in batches]
         ends = np.cumsum([len(kind) for kind in kinds])[:-1]
@@ -183,12 +193,14 @@ class Minifier:
             for some, more in ((~fine & (edge | (kind == LIT)), 1), (fine, OUTLINE)):
                 rows = np.flatnonzero(some)
                 for first in range(0, len(rows), CHUNK // more**2):
-                    part = rows[first : first + CHUNK // more**2]
-                    yield self._look(batch, part, self.traced(batch, more * side, part))
+                    yield partial(self._of_rows, batch, rows[first : first + CHUNK // more**2], more * side)
             dark = np.flatnonzero(~edge & (kind == DARK))
             for first in range(0, len(dark), TOGETHER):
                 part = dark[first : first + TOGETHER]
-                yield self._look(batch, part, _darkness(len(part)))
+                yield partial(self._look, batch, part, _darkness(len(part)))
+
+    def _of_rows(self, batch: Batch, rows: Indices, side: int) -> Lookups:
+        return self._look(batch, rows, self.traced(batch, side, rows))
 
     # -- tracing -------------------------------------------------------------------------------------------------------
 
@@ -196,6 +208,9 @@ class Minifier:
         """Side x side rays of pixels of a batch, some or all."""
         number = batch.pixels[rows]
         width = self.camera.width
+        caps = batch.far_caps(self.camera, self.chamber, self.depth) if side <= MOST else None
+        if caps is not None:
+            return caps.look(number, None if batch.which is None else batch.which[rows], side, self.clear[number])
         own: Image = np.stack([number % width, number // width], -1).astype(np.float32)
         along = ((np.arange(side) + 0.5) / side - 0.5).astype(np.float32)
         offsets = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)

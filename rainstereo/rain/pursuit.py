@@ -29,7 +29,7 @@ from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.types import Array, Image, Indices, Mask
 
 from .pyramid import LONG, Copy, copies, copy_starts, sizes
-from .quadtree import Quadtree, Steps, Taps, brought_in, ends_of, mixed, of_some, span_of, whole
+from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, whole
 
 HALVINGS = 3
 SHAPES = tuple((a, b) for a in range(HALVINGS + 1) for b in range(HALVINGS + 1) if abs(a - b) <= LONG)
@@ -61,7 +61,9 @@ LARGE, UNEVEN = 4, 2.0
 and whole objects; what errors there count for."""
 AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
 POINTS_ALONG, MOST_ALONG = 32, 4
-"""Points along a pixel's side that rays stand for, each for its part, and along such a part at most."""
+"""Points along a pixel's side that rays stand for, each for its part, and along such a part, at most."""
+DENSE = 1.5
+"""Such points a texel of the window, along each side of a ray's part of the pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +95,8 @@ class Pursuit:
         Pixels that see several places far apart get those of the tree.
         """
         given = x, y
-        x, y, steps = brought_in(x, y, weights, self.size, self.tree.border)
-        span = span_of(x, y, weights)
-        able = np.flatnonzero((self.level(span) >= 0) & ~self.tree.is_loose(span, steps, weights))
+        x, y, steps, span, loose = self.tree.placed(x, y, weights)
+        able = np.flatnonzero((self.level(span) >= 0) & ~loose)
         rest = np.ones(len(span), dtype=np.bool_)
         rest[able] = False
         tree = self.tree.taps(given[0][:, rest], given[1][:, rest], weights[:, rest])
@@ -158,22 +159,27 @@ class Pursuit:
         words, scale, count = _dictionary(level), 0.5**level, weights.shape[1]
         first = np.floor((low + 0.5) * scale).astype(np.intp) & -ALIGNED  # column and row of the window
         each = min(max(POINTS_ALONG // math.isqrt(len(weights)), 1), MOST_ALONG)
-        parts: Image = ((np.arange(each) + 0.5) / each - 0.5).astype(np.float32)
         if compiled.available():
-            return self._compiled(level, first, x, y, weights, steps, parts)
+            return self._compiled(level, first, x, y, weights, steps, each)
         places, fine = SIDE * BINS, np.float32(scale * BINS)
+        across, down = (
+            np.clip(np.ceil(np.maximum(abs(one), abs(other)) * np.float32(DENSE * scale)), 1, each)
+            for one, other in (steps[:2], steps[2:])
+        )
         bins: Indices = np.empty((each**2, *weights.shape), dtype=np.intp)
-        for part, (a, b) in enumerate(product(parts, parts)):
+        shares: Image = np.zeros(bins.shape, dtype=np.float32)
+        for part, (n, m) in enumerate(product(range(each), range(each))):
+            a, b = (m + np.float32(0.5)) / across - np.float32(0.5), (n + np.float32(0.5)) / down - np.float32(0.5)
             j, i = (
-                (folded_along(at + a * right + b * below, n - 1, self.tree.border) + np.float32(0.5)) * fine - start
-                for at, right, below, n, start in zip(
+                (folded_along(at + b * below + a * right, end - 1, self.tree.border) + np.float32(0.5)) * fine - start
+                for at, right, below, end, start in zip(
                     (x, y), steps[:2], steps[2:], self.size, first * BINS, strict=True
                 )
             )
             j, i = (np.clip(at, 0, places - 1).astype(np.intp) for at in (j, i))
             bins[part] = i * places + j
-        where = np.moveaxis(bins, -1, 0).reshape(count, -1)
-        share = np.tile(np.float32(1 / len(bins)) * weights.T, len(bins))
+            shares[part] = np.where((m < across) & (n < down), weights / (across * down), 0)
+        where, share = (values.T.reshape(count, -1) for values in (bins, shares))
         common = _common(words, where, share)
         offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
@@ -183,7 +189,7 @@ class Pursuit:
         return _Chosen(texel, weight, counts)
 
     def _compiled(
-        self, level: int, first: Indices, x: Array, y: Array, weights: Array, steps: Steps, parts: Image
+        self, level: int, first: Indices, x: Array, y: Array, weights: Array, steps: Steps, each: int
     ) -> _Chosen:
         from rainstereo.compiled.pursuit import choose
 
@@ -192,13 +198,13 @@ class Pursuit:
         weight: Array = np.zeros((count, MOST))
         counts: Indices = np.zeros(count, dtype=np.intp)
         shapes = np.array([(*shape, *self._limits(level, shape)) for shape in SHAPES], dtype=np.int64)
-        least = np.float32(FRESH) * np.diag(words.gram)
+        variance, scale = np.ascontiguousarray(np.diag(words.gram)), 0.5**level
         last = tuple(np.float32(n - 1) for n in self.size)
         rays = np.stack([x.T, y.T, *(step.T for step in steps), weights.T], axis=1)
         choose(
-            words.lags, words.gram, _atoms(), shapes, self._prices(level), least, SCREENED, OFFERED, NEGATIVE, RIDGE,
-            RIDGE_GROWS, AROUND, first, rays, parts, np.float32(BINS * 0.5**level), last, self.tree.border == "mirror",
-            texel, weight, counts,
+            words.lags, words.gram, variance, _atoms(), shapes, self._prices(level), np.float32(FRESH) * variance,
+            SCREENED, OFFERED, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each, np.float32(BINS * scale),
+            np.float32(DENSE * scale), last, self.tree.border == "mirror", texel, weight, counts,
         )  # fmt: skip
         return _Chosen(texel, weight, counts)
 

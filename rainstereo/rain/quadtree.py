@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from rainstereo import compiled
 from rainstereo.patch import folded_along, turned_along
 from rainstereo.types import Array, Image, Indices, Mask
 
@@ -77,9 +78,7 @@ class Quadtree:
         return Taps(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("texels", "weights", "counts", "error")))
 
     def _some(self, x: Array, y: Array, weights: Array, side: int) -> Taps:
-        x, y, steps = brought_in(x, y, weights, self.size, self.border)
-        span = span_of(x, y, weights)
-        loose = self.is_loose(span, steps, weights)
+        x, y, steps, span, loose = self.placed(x, y, weights)
         if loose.any():
             tight = np.flatnonzero(~loose)
             rays = [columns[:, tight] for columns in (x, y, weights)]
@@ -88,6 +87,23 @@ class Quadtree:
             rays = [columns[:, apart] for columns in (x, y, weights)]
             return mixed(loose, one, self._apart(rays[0], rays[1], rays[2], of_some(steps, apart)))
         return self._together(x, y, weights, steps, span, side)
+
+    def placed(self, x: Array, y: Array, weights: Array) -> tuple[Array, Array, Steps, Array, Mask]:
+        """`brought_in`, `span_of` and `is_loose` of rays, (K, M) float32."""
+        if not compiled.available():
+            x, y, steps = brought_in(x, y, weights, self.size, self.border)
+            span = span_of(x, y, weights)
+            return x, y, steps, span, self.is_loose(span, steps, weights)
+        from rainstereo.compiled.ray_steps import brought_in as swept
+
+        found: Image = np.empty((6, *weights.shape), dtype=np.float32)
+        span, loose = np.empty(weights.shape[1], dtype=np.float32), np.zeros(weights.shape[1], dtype=np.bool_)
+        last = [np.float32(n - 1) for n in self.size]
+        swept(
+            x, y, weights, *last, self.border == "mirror", np.float32(1 / JUMP), np.float32(LOOSE), found, span, loose
+        )
+        a, b, across_x, across_y, down_x, down_y = found
+        return a, b, (across_x, across_y, down_x, down_y), span, loose
 
     def is_loose(self, span: Array, steps: Steps, weights: Array) -> Mask:
         """Which pixels see several places far apart, (M,): a window for all of them would be too coarse."""

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rainstereo import compiled
 from rainstereo.patch import folded_along
 from rainstereo.rain.pyramid import copies, half, sizes, starts
 from rainstereo.rain.quadtree import UNIT, Quadtree, brought_in, steps_between
@@ -129,6 +130,28 @@ def test_steps_do_not_lead_to_what_another_drop_shows():
     alone.reshape(SIDE, SIDE, -1)[:, 2:] = 0  # two columns: whose steps these are cannot be told
     steps = steps_between(far.reshape(x.shape), y, alone)
     assert np.abs(steps[0].reshape(SIDE, SIDE, -1)[:, :2]).min() > 4000
+
+
+@pytest.mark.skipif(not compiled.available(), reason="numba is not installed")
+@pytest.mark.parametrize("border", ["mirror", "edge"])
+@pytest.mark.parametrize(("side", "count"), [(8, 301), (1, 20), (2, 77), (16, 30), (8, 0)])
+def test_rays_are_placed_compiled_as_not(border, side, count, monkeypatch):
+    """To the last bit: inside and beyond the image, with rays in the dark and some that look far away."""
+    rng, along = np.random.default_rng(0), np.arange(side)
+    x, y = (
+        np.float32(rng.uniform(-300, 800, count) + right * np.tile(along, side)[:, None])
+        + np.float32(down * np.repeat(along, side)[:, None] + rng.normal(0, 0.1, (side * side, count)))
+        for right, down in rng.normal(0, 1, (2, 2, count))
+    )
+    x[:, ::7] += 200 * (rng.random(x[:, ::7].shape) < 0.2)
+    weights = (rng.random(x.shape) * (rng.random(x.shape) < rng.random(count))).astype(np.float32)
+    tree = Quadtree(SIZE, 17, 0.02, border)
+    ours = tree.placed(x, y, weights)
+    monkeypatch.setattr(compiled, "available", lambda: False)
+    plain = tree.placed(x, y, weights)
+    for one, other in zip((*ours[:2], *ours[2], *ours[3:]), (*plain[:2], *plain[2], *plain[3:]), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert side < 8 or count == 0 or 0 < np.count_nonzero(ours[4]) < count
 
 
 @pytest.mark.parametrize("border", ["mirror", "edge"])

@@ -1,0 +1,120 @@
+"""Rays of pixels through caps on a far face, by a loop in machine code: what `trace` and `patch.answers` find.
+
+In double precision throughout, so that a pixel's rays do not depend on those that they are traced with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rainstereo import compiled
+from rainstereo.camera import Camera
+from rainstereo.chamber import Chamber
+from rainstereo.drop_grid import DropGrid
+from rainstereo.drop_stack import STEEPEST, DropStack
+from rainstereo.droplet import Drop, SphericalCap
+from rainstereo.patch import outside
+from rainstereo.spherical_refraction import CapColumns
+from rainstereo.trace import distorted
+from rainstereo.types import Array, Image, Indices
+
+from .samples import Samples
+
+MOST = 32  # rays along a pixel's side
+STEEPER = 1.5  # than rays through the middles of pixels are those that a grid is made for
+
+
+@dataclass(frozen=True, eq=False)
+class FarCaps:
+    """Caps on one far face, ready for the loop.
+
+    faces: those up to the caps', and those behind it, as `compiled.far_face.look` takes them. caps: (N, 6) float64.
+    """
+
+    camera: Camera
+    depth: float
+    drops: Sequence[Drop]
+    R: Array
+    faces: tuple[Array, Array]
+    end: float
+    origin: Array
+    caps: Array
+    grids: list[DropGrid]
+
+    @classmethod
+    def of(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber, depth: float) -> FarCaps | None:
+        """None if the loop does not suit: there is none, or there are other drops."""
+        places = {(drop.panel, drop.face) if isinstance(drop, SphericalCap) else None for drop in drops}
+        place = places.pop() if len(places) == 1 else None
+        if place is None or place[1] != "far" or not compiled.available():
+            return None
+        stack = DropStack(chamber, drops)
+        stack.check_depth(depth)
+        if stack.frame is None or not np.isfinite(stack.end):
+            return None
+        own = next(i for i, face in enumerate(stack.faces) if face.drops)
+        before = np.array([(face.z, face.n1, face.n2) for face in stack.faces[: own + 1]])
+        later = np.array(
+            [(b.z - a.z, b.n1, b.n2) for a, b in zip(stack.faces[own:], stack.faces[own + 1 :], strict=False)]
+        )
+        face = stack.faces[own]
+        columns = CapColumns.of([drop for drop in drops if isinstance(drop, SphericalCap)], face.origin)
+        caps = np.stack([getattr(columns, name) for name in columns.__dataclass_fields__], -1)
+        faces = before, later.reshape(-1, 3)
+        return cls(camera, depth, drops, stack.frame.R_panel_cam, faces, stack.end, face.origin, caps, [])
+
+    def look(self, pixels: Indices, which: Indices | None, side: int, clear: Array) -> Samples:
+        """side x side rays of pixels, (M,) numbers. which: (M,) cap of each; None: find out. clear: (M,), see
+        `patch.Patch.of_trace`."""
+        from rainstereo.compiled.far_face import look
+
+        camera, count = self.camera, len(pixels)
+        width = camera.width
+        pinhole = camera.model == "LENSMODEL_PINHOLE"
+        fx, fy, cx, cy = (float(c) for c in camera.intrinsics[:4])
+        to_panel = np.ascontiguousarray(self.R @ np.diag([1 / fx, 1 / fy, 1]))
+        directions = np.zeros((3, 0)) if pinhole else self._directions(pixels, side)
+        source: Image = np.empty((side * side, count, 2), dtype=np.float32)
+        gain, opacity = np.empty_like(source[..., 0]), np.empty_like(source[..., 0])
+        look(
+            pixels.astype(np.int64, copy=False), np.zeros(0, np.int64) if which is None else which.astype(np.int64),
+            width, side, directions, to_panel, np.array([cx, cy]), self.faces[0], self.caps, self.faces[1],
+            self._grid(pixels if which is None else pixels[:0]), np.ascontiguousarray(np.diag([fx, fy, 1]) @ self.R.T),
+            np.array([cx, cy, self.end, 1 / self.depth]), clear.astype(np.float64), source, gain, opacity,
+        )  # fmt: skip
+        if not pinhole:
+            lit = gain > 0
+            straight = source[lit]
+            bent = distorted(straight, camera)
+            unseen = np.isnan(bent[:, 0])
+            bent[unseen] = outside(straight[unseen], camera)
+            source[lit] = bent
+        return Samples(source, gain, opacity)
+
+    def _directions(self, pixels: Indices, side: int) -> Array:
+        """Of all rays, in the panel frame, (3, K M)."""
+        along = ((np.arange(side) + 0.5) / side - 0.5).astype(np.float32)
+        b, a = (part.reshape(-1, 1) for part in np.meshgrid(along, along, indexing="ij"))
+        number = pixels.astype(np.intp)
+        u, v = (number % self.camera.width).astype(np.float32) + a, (number // self.camera.width).astype(np.float32) + b
+        columns = self.camera.unproject_columns(u.ravel().astype(np.float64), v.ravel().astype(np.float64))
+        return np.ascontiguousarray(self.R @ np.stack(np.broadcast_arrays(*columns)))
+
+    def _grid(self, pixels: Indices) -> tuple[Any, ...]:
+        """Which caps are where on the face, for rays of these pixels."""
+        if not len(pixels):
+            none = np.zeros((4, 0), dtype=np.float32), np.zeros((0, 0), dtype=np.int64), np.zeros(0, dtype=np.int64)
+            return np.zeros(2, dtype=np.float32), np.float32(1), np.zeros(2, dtype=np.int64), *none
+        kx, ky, kz = self._directions(pixels, 1)
+        square = (kx * kx + ky * ky) / (kz * kz)  # of the slope in the air before the panels, and so behind them
+        steepest = min(float(np.sqrt(np.nanmax(square, initial=0))), STEEPEST)
+        if not self.grids or self.grids[0].margin < steepest:
+            margin = min(STEEPER * steepest, STEEPEST)
+            self.grids[:] = [DropGrid(dict(enumerate(self.drops)), self.origin, margin)]
+        grid = self.grids[0]
+        low, table = grid.low.astype(np.float32), np.ascontiguousarray(grid.table, dtype=np.float32)
+        return low, np.float32(grid.cell), grid.size.astype(np.int64), table, grid.candidates, grid.numbers
