@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from .compile import compiled, inlined
+from .exchange import exchange
 from .window_sums import TOGETHER, add, correlate, points
 
 U = np.uint64
@@ -17,8 +18,8 @@ ZERO, ONE = np.float32(0), np.float32(1)
 @compiled
 def choose(
     lags: Any, gram: Any, variance: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int, fewer: int,
-    negative: float, ridge: float, grows: float, around: int, first: Any, rays: Any, most_points: int, fine: Any,
-    dense: Any, last: Any, mirrored: bool, texel: Any, weight: Any, counts: Any,
+    rounds: int, gain: float, negative: float, ridge: float, grows: float, around: int, first: Any, rays: Any,
+    most_points: int, fine: Any, dense: Any, last: Any, mirrored: bool, texel: Any, weight: Any, counts: Any,
 ) -> None:  # fmt: skip
     """Write texels and their weights, (M, MOST) int64, float64, and how many, (M,).
 
@@ -26,8 +27,8 @@ def choose(
     and row of each texel of a window, those of the window's own first. shapes: (S, 5) int64 halvings across and down,
     width, height and first number of the copy, which is empty if none is offered. price, least: (A,) float32: what a
     texel must be worth, and what must be news of its variance. After so many texels (`screened`) only `fewer` others,
-    those worth most then, are offered. negative, ridge, grows: what weights below 0 may add up to, and what their
-    square sum costs, more and more, where it is more. around: texels around the rays that are near. first: (2, M)
+    those worth most then, are offered. rounds, gain: see `rain.exchange`.
+    negative, ridge, grows: what weights below 0 may add up to, and what their square sum costs, more and more, where it is more. around: texels around the rays that are near. first: (2, M)
     column and row of the windows. rays, most_points, fine, dense, last, mirrored: see `points`; rays are those of all
     pixels, (M, 7, K).
     """
@@ -45,6 +46,8 @@ def choose(
     x, y, share = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     u, v, starts = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
     factor, free, even = np.empty((most, most), np.float64), np.empty(most, np.float64), np.empty(most, np.float64)
+    inverse, inner = np.empty((most, most)), np.empty(most)
+    lines, wide_room = np.empty((2, most, size)), np.empty((4, size))
     for pixel in range(U(len(rays))):
         column, row = first[U(0), pixel], first[U(1), pixel]
         lit, total = points(
@@ -69,12 +72,17 @@ def choose(
                 best = U(0)
                 while U(columns[best]) != chosen:
                     best += U(1)
-            for before in range(count):
-                between[number, before] = gram[chosen, taken[before]]
             for i in range(there):
                 base[i] = gram[chosen, columns[i]]
             orthogonal(base, bases, number, best, there)
             go_on(base, bases[number], rest, news, cost, low, score, best, there)
+        there = offer(shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low)
+        count = exchange(
+            gram, along, price, least, columns, there, rounds, gain, taken, count, inverse, inner, lines, wide_room
+        )  # fmt: skip
+        for number in range(count):
+            for before in range(number + U(1)):
+                between[number, before] = gram[taken[number], taken[before]]
         toll = 0.0
         while True:
             solve(between, along, taken, count, total, toll, factor, free, even, weight[pixel])

@@ -28,6 +28,7 @@ from rainstereo.patch import folded_along
 from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.types import Array, Image, Indices, Mask
 
+from .exchange import GAIN, ROUNDS, exchanged
 from .pyramid import LONG, Copy, copies, copy_starts, sizes
 from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, whole
 
@@ -62,7 +63,7 @@ and whole objects; what errors there count for."""
 AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
 POINTS_ALONG, MOST_ALONG = 32, 4
 """Points along a pixel's side that rays stand for, each for its part, and along such a part, at most."""
-DENSE = 1.5
+DENSE = 2.5
 """Such points a texel of the window, along each side of a ray's part of the pixel."""
 
 
@@ -183,7 +184,9 @@ class Pursuit:
         common = _common(words, where, share)
         offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
-        taken, counts = _taken(words, along, offered, self._prices(level))
+        price, least = self._prices(level), np.float32(FRESH) * np.diag(words.gram)
+        taken, counts = _taken(words, along, offered, price)
+        taken, counts = exchanged(words.gram, along, offered, price, least, taken, counts)
         weight = _gentle(words, along, taken, counts, share.sum(1, dtype=np.float64))
         texel = np.take_along_axis(numbers, taken, 1)
         return _Chosen(texel, weight, counts)
@@ -203,8 +206,8 @@ class Pursuit:
         rays = np.stack([x.T, y.T, *(step.T for step in steps), weights.T], axis=1)
         choose(
             words.lags, words.gram, variance, _atoms(), shapes, self._prices(level), np.float32(FRESH) * variance,
-            SCREENED, OFFERED, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each, np.float32(BINS * scale),
-            np.float32(DENSE * scale), last, self.tree.border == "mirror", texel, weight, counts,
+            SCREENED, OFFERED, ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each,
+            np.float32(BINS * scale), np.float32(DENSE * scale), last, self.tree.border == "mirror", texel, weight, counts,
         )  # fmt: skip
         return _Chosen(texel, weight, counts)
 
