@@ -207,7 +207,8 @@ class Pursuit:
         choose(
             words.lags, words.gram, variance, _atoms(), shapes, self._prices(level), np.float32(FRESH) * variance,
             SCREENED, OFFERED, ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each,
-            np.float32(BINS * scale), np.float32(DENSE * scale), last, self.tree.border == "mirror", texel, weight, counts,
+            np.float32(BINS * scale), np.float32(DENSE * scale), last, self.tree.border == "mirror", texel, weight,
+            counts,
         )  # fmt: skip
         return _Chosen(texel, weight, counts)
 
