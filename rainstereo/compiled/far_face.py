@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from .compile import compiled, fused, fused_part
+from .compile import compiled, fused_part
 
 U = np.uint64
-ROOM = 1024  # rays of a pixel, at most
+ROOM = 1024 + 72  # rays of a pixel, at most, and so many that planes do not compete for the same lines of a cache
 X, Y, KX, KY, KZ, RISE, PASSED, COVERED, LIT = (U(ROOM * i) for i in range(9))
 CX, CY, SQUARE, DEPTH, CURVATURE, INDEX = (U(ROOM * i) for i in range(9, 15))
 PLANES = 15
@@ -36,8 +36,8 @@ def look(
     1). lens: (2,) c_x, c_y. before: (F, 3) float64, distance along the normal and the indices on both sides, of the
     faces up to the caps', which is the last. caps: (N, 6) float64 centre in the panel frame, contact radius squared,
     depth of the sphere's centre, 1 / its radius, index. later: (F, 3) thickness before a face and the indices on both
-    sides. grid: see `whose`. to_image: (3, 3) from the panel frame. view: (4,) c_x, c_y, distance of the last face, 1 / depth. clear:
-    (M,) float64 what reaches each pixel through the bare panels.
+    sides. grid: see `whose`. to_image: (3, 3) from the panel frame. view: (4,) c_x, c_y, distance of the last face,
+    1 / depth. clear: (M,) float64 what reaches each pixel through the bare panels.
     """
     rays = np.zeros(PLANES * ROOM, np.float64)
     count = U(side * side)
