@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .compile import compiled, inlined
-from .window_sums import TOGETHER, add, correlate, points
+from .window_sums import TOGETHER, WIDE, add, copy, correlate, points
 
 U = np.uint64
 FAR = np.float32(np.inf)
@@ -16,31 +16,29 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 @compiled
 def choose(
-    lags: Any, gram: Any, variance: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int, fewer: int,
-    negative: float, ridge: float, grows: float, around: int, first: Any, rays: Any, most_points: int, fine: Any,
-    dense: Any, last: Any, mirrored: bool, texel: Any, weight: Any, counts: Any,
+    lags: Any, pairs: Any, begin: Any, variance: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int,
+    fewer: int, negative: float, ridge: float, grows: float, around: int, first: Any, rays: Any, most_points: int,
+    fine: Any, dense: Any, last: Any, mirrored: bool, texel: Any, weight: Any, counts: Any,
 ) -> None:  # fmt: skip
     """Write texels and their weights, (M, MOST) int64, float64, and how many, (M,).
 
-    lags, gram: `rain.pursuit._Dictionary`; variance: (A,) float32, gram's diagonal. atoms: (A, 3) int64 shape, column
-    and row of each texel of a window, those of the window's own first. shapes: (S, 5) int64 halvings across and down,
-    width, height and first number of the copy, which is empty if none is offered. price, least: (A,) float32: what a
-    texel must be worth, and what must be news of its variance. After so many texels (`screened`) only `fewer` others,
-    those worth most then, are offered. negative, ridge, grows: what weights below 0 may add up to, and what their
-    square sum costs, more and more, where it is more. around: texels around the rays that are near. first: (2, M)
-    column and row of the windows. rays, most_points, fine, dense, last, mirrored: see `points`; rays are those of all
-    pixels, (M, 7, K).
+    lags: `rain.pursuit._Dictionary`. pairs, begin: see `common_of`; variance: (A,) float32 of texels. atoms: (A, 3)
+    int64 shape, column and row of each texel of a window, those of the window's own first. shapes: (S, 5) int64
+    halvings across and down, width, height and first number of the copy, which is empty if none is offered. price,
+    least: (A,) float32: what a texel must be worth, and what must be news of its variance. After so many texels
+    (`screened`) only `fewer` others, those worth most then, are offered. negative, ridge, grows: what weights below 0
+    may add up to, and what their square sum costs, more and more, where it is more. around: texels around the rays that
+    are near. first: (2, M) column and row of the windows. rays, most_points, fine, dense, last, mirrored: see `points`;
+    rays are those of all pixels, (M, 7, K).
     """
     size, most, room = U(len(atoms)), U(texel.shape[1]), rays.shape[2] * most_points**2 + TOGETHER
     side = U(lags.shape[2] + 1) // U(2)
-    along, common, wide = (
-        np.zeros(size, np.float32),
-        np.zeros((side, side), np.float32),
-        np.empty(side * side, np.float32),
-    )
+    along, common = np.zeros(size, np.float32), np.zeros((side, side), np.float32)
+    wide = np.empty(side * side, np.float32)
     columns, rest, news = np.empty(size, np.uint32), np.empty(size, np.float32), np.empty(size, np.float32)
     cost, low, score = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    base, bases = np.empty(size, np.float32), np.empty((most, size), np.float32)
+    base, bases = np.empty(size + U(WIDE), np.float32), np.empty((most, size), np.float32)
+    rects = np.zeros((len(shapes), 4), np.int64)
     taken, between, box = np.empty(most, np.uint64), np.empty((most, most), np.float64), np.empty(4, np.int64)
     x, y, share = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     u, v, starts = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
@@ -53,10 +51,12 @@ def choose(
         )  # fmt: skip
         correlate(lags, u, v, share, lit, box, starts, common, wide)
         add(common, shapes, along)
-        there = offer(shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low)
+        there = offer(
+            shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low, rects
+        )
         for i in range(there):
             score[i] = rest[i] * rest[i] / (news[i] * cost[i])
-        count = U(0)
+        count, fewer_left = U(0), False
         for number in range(most):
             best = highest(score, there)
             if best == there or (number > U(0) and not score[best] > 1):
@@ -66,13 +66,17 @@ def choose(
             count += U(1)
             if number == U(screened) and there > U(fewer):
                 there = screen(score, U(fewer), number, there, rest, news, cost, low, columns, bases)
-                best = U(0)
+                best, fewer_left = U(0), True
                 while U(columns[best]) != chosen:
                     best += U(1)
+            own = atoms[chosen]
             for before in range(count):
-                between[number, before] = gram[chosen, taken[before]]
-            for i in range(there):
-                base[i] = gram[chosen, columns[i]]
+                between[number, before] = common_of(pairs, begin, shapes, side, own, atoms[taken[before]])
+            if number < U(screened) or not fewer_left:
+                rows_of(pairs, begin, shapes, side, own, rects, base)
+            else:
+                for i in range(there):
+                    base[i] = common_of(pairs, begin, shapes, side, own, atoms[columns[i]])
             orthogonal(base, bases, number, best, there)
             go_on(base, bases[number], rest, news, cost, low, score, best, there)
         toll = 0.0
@@ -98,9 +102,12 @@ def choose(
 @inlined
 def offer(
     shapes: Any, side: Any, column: Any, row: Any, box: Any, along: Any, variance: Any, price: Any, least: Any,
-    columns: Any, rest: Any, news: Any, cost: Any, low: Any,
+    columns: Any, rest: Any, news: Any, cost: Any, low: Any, rects: Any,
 ) -> Any:  # fmt: skip
-    """Write what is known of the texels that the image has and a box meets; returns how many."""
+    """Write what is known of the texels that the image has and a box meets; returns how many.
+
+    rects: (S, 4) of each shape the first and last column and row of these.
+    """
     there, start, last = U(0), np.int64(0), np.int64(side) - 1
     for shape in range(U(len(shapes))):
         across, down = shapes[shape, U(0)], shapes[shape, U(1)]
@@ -108,6 +115,7 @@ def offer(
         left, top = max(box[0], 0) >> across, max(box[2], 0) >> down
         right = min(min(box[1], last) >> across, shapes[shape, U(2)] - 1 - (column >> across))
         bottom = min(min(box[3], last) >> down, shapes[shape, U(3)] - 1 - (row >> down))
+        rects[shape, U(0)], rects[shape, U(1)], rects[shape, U(2)], rects[shape, U(3)] = left, right, top, bottom
         for k in range(top, bottom + 1):
             begin = U(start + k * width)
             for i in range(begin + U(left), begin + U(max(right + 1, left))):
@@ -116,6 +124,59 @@ def offer(
                 there += U(1)
         start += width * height
     return there
+
+
+@inlined
+def place_of(pairs_begin: Any, shapes: Any, side: Any, own: Any, other: Any) -> Any:
+    """Where a table begins of what texels of a shape have in common with one texel; see `common_of`.
+
+    Returns the place of the texel at column 0 and row 0, and how far rows are apart.
+    """
+    shape = U(own[U(0)])
+    across, down = shapes[other, U(0)] - shapes[U(0), U(0)], shapes[other, U(1)] - shapes[U(0), U(1)]
+    finer_x = across - (shapes[shape, U(0)] - shapes[U(0), U(0)])
+    finer_y = down - (shapes[shape, U(1)] - shapes[U(0), U(1)])
+    width, height = np.int64(side) >> across, np.int64(side) >> down
+    column, row, phase_x, phase_y = own[U(1)], own[U(2)], np.int64(0), np.int64(0)
+    if finer_x > 0:
+        phase_x = -column & ((1 << finer_x) - 1)
+        column = (column + phase_x) >> finer_x
+    else:
+        column <<= -finer_x
+    if finer_y > 0:
+        phase_y = -row & ((1 << finer_y) - 1)
+        row = (row + phase_y) >> finer_y
+    else:
+        row <<= -finer_y
+    apart = (np.int64(1) << max(finer_x, 0)) * 2 * width
+    line = phase_y * 2 * height + height - row
+    return pairs_begin[shape, other] + line * apart + phase_x * 2 * width + width - column, apart
+
+
+@inlined
+def common_of(pairs: Any, begin: Any, shapes: Any, side: Any, own: Any, other: Any) -> Any:
+    """What two texels, (3,) shape, column and row, have in common.
+
+    pairs: (N,) float32, a table for each pair of shapes, which begin at begin, (S, S): rows for each phase of the
+    first texel in the second's grid and each distance, and in them the same for columns. That is all it depends on.
+    """
+    first, apart = place_of(begin, shapes, side, own, U(other[U(0)]))
+    return pairs[U(first + other[U(2)] * apart + other[U(1)])]
+
+
+@inlined
+def rows_of(pairs: Any, begin: Any, shapes: Any, side: Any, own: Any, rects: Any, base: Any) -> None:
+    """The same of a texel with all that are offered, in their order."""
+    at = U(0)
+    for shape in range(U(len(shapes))):
+        left, right = rects[shape, U(0)], rects[shape, U(1)]
+        if right < left:
+            continue
+        first, apart = place_of(begin, shapes, side, own, shape)
+        count = U(right + 1 - left)
+        for k in range(rects[shape, U(2)], rects[shape, U(3)] + 1):
+            copy(pairs, U(first + k * apart + left), base, at, count)
+            at += count
 
 
 @inlined

@@ -63,7 +63,32 @@ def _sweep(
     return types.void(table, starts, weights, number, number, number, number, sums), code
 
 
+@intrinsic
+def _copy(_context: Any, source: Any, _first: Any, target: Any, _at: Any, _count: Any) -> Any:
+    """copy(source, first, target, at, count): so many numbers, and up to 7 more that are written over next."""
+
+    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        data, first, to, at, count = (
+            context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
+            for kind, value in zip(signature.args, given, strict=True)
+        )
+        rounds = builder.udiv(builder.add(count, LONG(WIDE - 1)), LONG(WIDE))
+        with cgutils.for_range(builder, rounds, intp=LONG) as loop:
+            done = builder.mul(loop.index, LONG(WIDE))
+            values = builder.load(
+                builder.bitcast(builder.gep(data, [builder.add(first, done)]), REALS.as_pointer()), align=4
+            )
+            builder.store(
+                values, builder.bitcast(builder.gep(to, [builder.add(at, done)]), REALS.as_pointer()), align=4
+            )
+        return context.get_dummy_value()
+
+    number = types.uint64
+    return types.void(source, number, target, number, number), code
+
+
 sweep: Any = _sweep
+copy: Any = _copy
 
 
 @inlined
