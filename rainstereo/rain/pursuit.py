@@ -179,7 +179,8 @@ class Pursuit:
             j, i = (np.clip(at, 0, places - 1).astype(np.intp) for at in (j, i))
             bins[part] = i * places + j
             shares[part] = np.where((m < across) & (n < down), weights / (across * down), 0)
-        where, share = (values.T.reshape(count, -1) for values in (bins, shares))
+        where: Indices = bins.T.reshape(count, -1)
+        share: Image = shares.T.reshape(count, -1)
         common = _common(words, where, share)
         offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
