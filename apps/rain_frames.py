@@ -124,7 +124,7 @@ def write_frame(
     if outputs.lists:
         text = drop_list.to_json(plan.drops, seed=seed, **plan.renderer.settings)
         files.append(_write(outputs.folder, f"drops/{name}.json", text.encode()))
-    quality = measured(clear, rainy, outputs.ssim)
+    quality = measured(plan.renderer.framed(clear), rainy, outputs.ssim)
     return {
         "name": name,
         "files": files,
@@ -168,9 +168,12 @@ def _write_image(folder: Path, name: str, image: Image) -> str:
 
 
 def _label(label: Label, plan: Plan, unknown: bool) -> bytes:
-    """The file, bit for bit, or with what drops hide marked."""
+    """The file, bit for bit, or the frame's part of it, or with what drops hide marked."""
     data = imagefile.read_bytes(label.path)
-    return _marked(data, label, hidden(plan)) if unknown and label.void is not None else data
+    where = hidden(plan) if unknown and label.void is not None else None
+    if where is None and plan.renderer.scene_size == plan.renderer.camera.size:
+        return data
+    return _marked(data, label, plan, where)
 
 
 def hidden(plan: Plan) -> Mask:
@@ -178,16 +181,19 @@ def hidden(plan: Plan) -> Mask:
     return np.asarray((plan.opacity >= OPAQUE) | plan.unknown)
 
 
-def _marked(data: bytes, label: Label, where: Mask) -> bytes:
+def _marked(data: bytes, label: Label, plan: Plan, where: Mask | None) -> bytes:
+    """The frame's part of a label; void where it says so."""
     if data[:4] == b"\x89PNG" and data[25] == 3:
         raise ValueError(f"{label.path} has a palette, whose numbers would be lost; store the labels as gray PNG")
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise ValueError(f"the label {label.path} is not an image, or a damaged one")
-    if image.shape[:2] != where.shape:
+    (width, height), (x, y), size = plan.renderer.scene_size, plan.renderer.shift, plan.renderer.camera.size
+    if image.shape[:2] != (height, width):
         raise ValueError(
-            f"the label {label.path} has {image.shape[1]} x {image.shape[0]} pixels, its image {where.shape[1]} x "
-            f"{where.shape[0]}"
+            f"the label {label.path} has {image.shape[1]} x {image.shape[0]} pixels, its image {width} x {height}"
         )
-    image[where] = (*(label.void,) * 3, 255)[: image.shape[2]] if image.ndim == 3 else label.void
+    image = image[y : y + size[1], x : x + size[0]]
+    if where is not None:
+        image[where] = (*(label.void,) * 3, 255)[: image.shape[2]] if image.ndim == 3 else label.void
     return cv2.imencode(".png", image)[1].tobytes()

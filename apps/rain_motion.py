@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from rainstereo.apps.rain_frames import Note, Outputs, failure, stamp, write_frame, write_note
-from rainstereo.apps.rain_settings import Rain, Size, psnr
+from rainstereo.apps.rain_settings import Rain, Size, psnr_under
 from rainstereo.apps.rain_sources import Source
 from rainstereo.rain.drops import Drops
 from rainstereo.rain.motion import Motion, PaneState
@@ -99,7 +99,7 @@ class Sequence:
 
     def psnr_at(self, image: Image, frame: int) -> float:
         """PSNR of a frame."""
-        return psnr(image, self.plan(frame).apply(image))
+        return psnr_under(self.plan(frame), image)
 
     def with_share(self, share: float) -> Sequence:
         """The same with a share of the heaviest rain's drops at the start."""
@@ -166,9 +166,8 @@ def render_video(
     target = outputs.folder / f"{source.name}{suffix}"
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f".{target.stem}.partial{suffix}")
-    writer = cv2.VideoWriter(
-        str(partial), cv2.VideoWriter.fourcc(*CODECS[suffix]), sequence.drive.fps, sequence.drive.size
-    )
+    size = sequence.rain.renderer(sequence.drive.size).camera.size
+    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*CODECS[suffix]), sequence.drive.fps, size)
     notes: list[Note] = []
     try:
         if not writer.isOpened():

@@ -15,6 +15,7 @@ from rainstereo.apps.rain_motion import MotionKind
 from rainstereo.apps.rain_presets import REGIMES, Setup, preset
 from rainstereo.apps.rain_settings import Rain, Size
 from rainstereo.apps.rain_sources import Source
+from rainstereo.rain.render import Surround
 from rainstereo.rig import Role
 
 
@@ -72,6 +73,9 @@ class Options:
     """Gray levels of 8 bits, RMS inside sharp drops, that rendering may be off."""
     border: Literal["mirror", "edge"] = "mirror"
     """How the scene goes on beyond the image, where drops look there."""
+    surround: tuple[int, int, int, int] | None = None
+    """LEFT TOP RIGHT BOTTOM, pixels: rain is put on the part of each image inside these, and what drops show from
+    beyond it is the image itself. OUT holds that part, of images and labels; camera and --rig are the whole image's."""
     linear_light: bool = False
     """Take values for sRGB and average light."""
     masks: bool = False
@@ -146,13 +150,38 @@ def settings(options: Options, images: list[Source]) -> Rain:
             raise ValueError(f"the rig {options.rig} has no chamber, so there is nothing for rain to fall on")
         seen = rig.camera(options.role), chamber
     rain = Rain(
-        _setup(options, images), options.seed, options.depth_m, options.tolerance, options.border,
+        _setup(options, images), options.seed, options.depth_m, options.tolerance, _border(options),
         options.linear_light, options.psnr, options.psnr_tolerance, None, seen,
         None if options.drops is None else options.drops.read_text(encoding="utf-8"), options.merge, options.quick,
     )  # fmt: skip
     listed = rain.drop_list
-    rain.renderer(listed[0].camera.size if listed else seen[0].size if seen else (64, 48))  # says what is wrong
+    sides = options.surround or (0, 0, 0, 0)
+    any_size = 64 + sides[0] + sides[2], 48 + sides[1] + sides[3]
+    rain.renderer(listed[0].scene_size if listed else seen[0].size if seen else any_size)  # says what is wrong
     return rain
+
+
+def _border(options: Options) -> str | Surround:
+    if options.surround is None:
+        return options.border
+    if options.drops is not None:
+        raise ValueError(
+            "--surround and --drops were given; a drop list says itself what is around its frame, so leave out "
+            "--surround"
+        )
+    if options.border != "mirror":
+        raise ValueError(
+            "--surround and --border edge were given; what lies beyond the whole image is mirrored, so leave out one"
+        )
+    if not any(options.surround):
+        raise ValueError(
+            "--surround 0 0 0 0 was given; expected pixels LEFT TOP RIGHT BOTTOM around the part of each image that "
+            "gets rain, such as 64 48 64 48"
+        )
+    try:
+        return Surround(*options.surround)
+    except ValueError as error:
+        raise ValueError(f"--surround {' '.join(map(str, options.surround))}: {error}") from error
 
 
 def size_of(source: Source) -> Size:

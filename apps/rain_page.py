@@ -19,6 +19,7 @@ from rainstereo.apps.rain_settings import Rain
 from rainstereo.apps.rain_sources import VIDEOS
 from rainstereo.apps.report import Report, Tile, quantity
 from rainstereo.apps.run_record import Record
+from rainstereo.rain.render import Surround
 from rainstereo.rain.severity import Met
 from rainstereo.types import Image
 
@@ -43,8 +44,8 @@ def rain_page(folder: Path, rain: Rain, record: Record, notes: Sequence[Note], m
         Tile("opacity", quantity(100 * cover["mean"]), "%", "mean of all pixels"),
     )
     if done:
-        _compare(page, folder, done)
-        _sheet(page, folder, done)
+        _compare(page, folder, rain, done)
+        _sheet(page, folder, rain, done)
     if len(values_of(done, "psnr")) > 1:
         page.section("Severity", "How much the drops take from each image, and how much of it they cover.")
         page.figure(severities(values_of(done, "psnr"), rain.psnr), f"PSNR of each image. {PROTOCOL}.")
@@ -84,18 +85,18 @@ def _verdict(page: Report, rain: Rain, done: list[Note], wrong: list[Note], mean
     page.verdict("warn" if wrong else "good", words + (f" {len(wrong)} files failed." if wrong else ""))
 
 
-def _compare(page: Report, folder: Path, done: list[Note]) -> None:
+def _compare(page: Report, folder: Path, rain: Rain, done: list[Note]) -> None:
     page.section("Clear and rainy", "Left of the cut the clear image, right of it the same under rain.")
     for note in _spread(done, COMPARED):
-        pair = _pair(folder, note)
+        pair = _pair(folder, rain, note)
         if pair is not None:
             clear, rainy = (_scaled(image, WIDEST) for image in pair)
             page.compare(clear, rainy, ("clear", "rainy"), _words(note))
 
 
-def _sheet(page: Report, folder: Path, done: list[Note]) -> None:
+def _sheet(page: Report, folder: Path, rain: Rain, done: list[Note]) -> None:
     page.section("Contact sheet", "Evenly over the whole.")
-    shown = [(note, pair[1]) for note in _spread(done, SHOWN) if (pair := _pair(folder, note)) is not None]
+    shown = [(note, pair[1]) for note in _spread(done, SHOWN) if (pair := _pair(folder, rain, note)) is not None]
     page.images([_scaled(image, THUMBNAIL) for _, image in shown], [_words(note) for note, _ in shown])
 
 
@@ -110,6 +111,10 @@ def _setup(page: Report, rain: Rain) -> None:
          f"{1000 * law.largest:.3g} mm, cover {population.cover:.3g}" + (" before the PSNR" if rain.psnr else "")),
         ("contact angle", "{:.0f} degrees, sigma {:.0f}".format(*np.degrees(population.contact_angle))),
     ]  # fmt: skip
+    if isinstance(rain.border, Surround):
+        sides = rain.border
+        given = f"{sides.left} px left, {sides.top} above, {sides.right} right, {sides.bottom} below"
+        rows.append(("surround", f"{given} of the part under rain; of the focal length's width they are part"))
     if rain.seen is not None:
         camera, chamber = rain.seen
         rows[0] = ("focal length", f"{camera.intrinsics[0]:.4g} px (the rig's)")
@@ -123,7 +128,7 @@ def _words(note: Note) -> str:
     return f"{note['name']}: {psnr}{ssim}, {100 * note['cover']:.0f} % hidden, {note['drops']:.0f} drops"
 
 
-def _pair(folder: Path, note: Note) -> tuple[Image, Image] | None:
+def _pair(folder: Path, rain: Rain, note: Note) -> tuple[Image, Image] | None:
     """Clear and rainy, of a video a frame of its middle; None where a file went away or changed since."""
     clear, rainy = Path(note["path"]), folder / note["files"][0]
     try:
@@ -132,9 +137,12 @@ def _pair(folder: Path, note: Note) -> tuple[Image, Image] | None:
             one, other = (next(frames(path, {middle}), (0, None))[1] for path in (clear, rainy))
         else:
             one, other = imagefile.read(clear), imagefile.read(rainy)
-    except imagefile.UnreadableImageError:
+        if one is None or other is None:
+            return None
+        one = rain.renderer((one.shape[1], one.shape[0])).framed(one)
+    except (imagefile.UnreadableImageError, ValueError):
         return None
-    return None if one is None or other is None or one.shape != other.shape else (one, other)
+    return None if one.shape != other.shape else (one, other)
 
 
 def _scaled(image: Image, width: int) -> Image:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,7 @@ from rainstereo.droplet import Drop
 from rainstereo.rain.drops import Drops
 from rainstereo.rain.motion import Motion
 from rainstereo.rain.pane import Pane
-from rainstereo.rain.render import AnyDrops, Plan, Renderer
+from rainstereo.rain.render import AnyDrops, Plan, Renderer, Surround
 from rainstereo.rain.sequence import joined_shapes
 from rainstereo.rain.severity import HEAVIEST, Met, NestedRain, UnreachablePsnrError, heaviest_cover, meet_psnr
 from rainstereo.types import Image
@@ -31,6 +31,7 @@ class Rain:
     """How rain is drawn and rendered; the same for all images. Goes to other processes as it is.
 
     seen: camera and chamber of a rig in place of the setup's; they fix the size of images.
+    border: see `Renderer`. With a `Surround` sizes are those of whole images, and so are cameras.
     psnr: to be met, dB, for each image, within psnr_tolerance; None: the population's own cover.
     share: of the heaviest rain's drops, for all images, in place of both; see `over_set`.
     listed: a drop list to be rendered on all images in place of everything else.
@@ -42,7 +43,7 @@ class Rain:
     seed: int = 0
     depth: float = math.inf
     tolerance: float = 1.0
-    border: str = "mirror"
+    border: str | Surround = "mirror"
     linear_light: bool = False
     psnr: float | None = None
     psnr_tolerance: float = 0.1
@@ -77,7 +78,7 @@ class Rain:
         return self._renderers[size]
 
     def _make(self, size: Size) -> tuple[Renderer, Pane]:
-        fixed = self.drop_list[0].camera.size if self.drop_list else self.seen[0].size if self.seen else size
+        fixed = self.drop_list[0].scene_size if self.drop_list else self.seen[0].size if self.seen else size
         if fixed != size:
             what = "the drop list was made" if self.drop_list else "the rig was calibrated"
             raise ValueError(
@@ -85,11 +86,28 @@ class Rain:
                 "that size, or leave out " + ("--drops" if self.drop_list else "--rig")
             )
         camera, chamber = self.seen or (self.setup.camera(size), self.setup.chamber)
+        camera = self.drop_list[0].camera if self.drop_list else self._inside(camera)
         pane = Pane.seen(camera, chamber, margin=self._reach)
         if self.drop_list:
             return self.drop_list[0], pane
         lens, light = self.setup.lens, self.linear_light
         return Renderer(camera, chamber, self.depth, lens, self.tolerance, self.border, light, self.quick), pane
+
+    def _inside(self, camera: Camera) -> Camera:
+        """The camera of the part of images that a surround leaves."""
+        sides = self.border
+        if not isinstance(sides, Surround):
+            return camera
+        width, height = camera.width - sides.left - sides.right, camera.height - sides.top - sides.bottom
+        if min(width, height) < 1:
+            raise ValueError(
+                f"the image has {camera.width} x {camera.height} pixels, and a surround of {sides.left} left, "
+                f"{sides.top} above, {sides.right} right and {sides.bottom} below leaves nothing of it; expected "
+                "less than its width and height together"
+            )
+        fx, fy, cx, cy, *others = camera.intrinsics.tolist()
+        moved = np.array([fx, fy, cx - sides.left, cy - sides.top, *others])
+        return replace(camera, intrinsics=moved, width=width, height=height, carried={})
 
     # -- which drops ---------------------------------------------------------------------------------------------------
 
@@ -158,7 +176,7 @@ class Rain:
         size: Size = (image.shape[1], image.shape[0])
         nested = self.nested(name, size)
         drops = nested.first(share * len(nested.drops))
-        return psnr(image, self.renderer(size).plan(self.standing(drops, name, size)).apply(image))
+        return psnr_under(self.renderer(size).plan(self.standing(drops, name, size)), image)
 
     def _meeting(self, target: float, nested: NestedRain, image: Image, name: str) -> tuple[Plan, Met]:
         size: Size = (image.shape[1], image.shape[0])
@@ -168,7 +186,7 @@ class Rain:
 
         def psnr_of(amount: float) -> float:
             plan = self.renderer(size).plan(self.standing(nested.first(amount), name, size))
-            value = psnr(image, plan.apply(image))
+            value = psnr_under(plan, image)
             if not plans or abs(value - target) < abs(best[0] - target):
                 plans.clear()
                 plans[amount], best[0] = plan, value
@@ -197,6 +215,11 @@ def over_set(rain: Rain, psnr_at: Callable[[float], float], moving: bool = False
         raise UnreachablePsnrError(
             f"{error}. Drops run off a pane in motion: --motion still keeps them, a shorter --refill-s brings more"
         ) from error
+
+
+def psnr_under(plan: Plan, image: Image) -> float:
+    """PSNR of an image's frame under rain."""
+    return psnr(plan.renderer.framed(image), plan.apply(image))
 
 
 def psnr(clear: Image, rainy: Image) -> float:

@@ -7,25 +7,30 @@ from typing import Any
 import numpy as np
 
 from .compile import fused, fused_part
+from .in_common import common_of, rows_of
 
 U = np.uint64
 
 
 @fused
 def exchange(
-    gram: Any, along: Any, price: Any, least: Any, columns: Any, there: Any, rounds: int, gain: float, taken: Any,
-    count: Any, inverse: Any, weight: Any, rows: Any, room: Any,
+    pairs: Any, begin: Any, shapes: Any, side: Any, atoms: Any, along: Any, variance: Any, price: Any, least: Any,
+    columns: Any, there: Any, rects: Any, rounds: int, gain: float, taken: Any, count: Any, inverse: Any, weight: Any,
+    rows: Any, room: Any, base: Any,
 ) -> Any:  # fmt: skip
     """Change the texels taken, the first `count` of `taken`, and return how many there are then.
 
-    gram: (A, A) float32. along, price, least: (A,) float32. columns: (A,) uint32, of which the first `there` are
-    offered. rounds, gain: see `rain.exchange`. inverse: (MOST, MOST), weight: (MOST,), rows: (2, MOST, A), room:
-    (4, A) float64, to work in.
+    pairs, begin, shapes, side, atoms: see `in_common`. along, variance, price, least: (A,) float32 of texels. columns:
+    (A,) uint32, of which the first `there` are offered, those of `rects`. rounds, gain: see `rain.exchange`. inverse:
+    (MOST, MOST), weight: (MOST,), rows: (2, MOST, A), room: (4, A) float64, base: (A + WIDE,) float32, to work in.
     """
     own, seen = rows[U(0)], rows[U(1)]  # what texels taken have in common with those offered; the same, of their news
     rest, news, most, which = room[U(0)], room[U(1)], room[U(2)], room[U(3)]
     for _ in range(rounds):
-        invert(gram, along, taken, count, inverse, weight)
+        for i in range(count):
+            for j in range(count):
+                inverse[i, j] = np.float64(common_of(pairs, begin, shapes, side, atoms[taken[i]], atoms[taken[j]]))
+        invert(along, taken, count, inverse, weight)
         worst, low = count, 1.0
         if count > U(1):
             for i in range(count):
@@ -39,11 +44,12 @@ def exchange(
             continue
         for i in range(there):
             column = U(columns[i])
-            rest[i], news[i] = np.float64(along[column]), np.float64(gram[column, column])
+            rest[i], news[i] = np.float64(along[column]), np.float64(variance[column])
         for k in range(count):
-            row, line = gram[taken[k]], own[k]
+            rows_of(pairs, begin, shapes, side, atoms[taken[k]], rects, base)
+            line = own[k]
             for i in range(there):
-                line[i] = np.float64(row[U(columns[i])])
+                line[i] = np.float64(base[i])
         for k in range(count):
             combine(inverse[k], own, count, there, seen[k])
             lower(rest, news, own[k], seen[k], weight[k], there)
@@ -110,12 +116,9 @@ def try_without(
 
 
 @fused_part
-def invert(gram: Any, along: Any, taken: Any, count: Any, inverse: Any, weight: Any) -> None:
-    """Of what texels taken have in common with one another; and their best weights."""
-    for i in range(count):
-        for j in range(count):
-            inverse[i, j] = np.float64(gram[taken[i], taken[j]])
-    for p in range(count):  # Gauss and Jordan, in place: the matrix is positive definite
+def invert(along: Any, taken: Any, count: Any, inverse: Any, weight: Any) -> None:
+    """Invert what texels taken have in common with one another, in place; and write their best weights."""
+    for p in range(count):  # Gauss and Jordan: the matrix is positive definite
         pivot = 1 / inverse[p, p]
         inverse[p, p] = 1.0
         for j in range(count):

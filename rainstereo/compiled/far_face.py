@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from .compile import compiled, fused, fused_part
+from .compile import compiled, fused_part
 
 U = np.uint64
-ROOM = 1024  # rays of a pixel, at most
+ROOM = 1024 + 72  # rays of a pixel, at most, and so many that planes do not compete for the same lines of a cache
 X, Y, KX, KY, KZ, RISE, PASSED, COVERED, LIT = (U(ROOM * i) for i in range(9))
 CX, CY, SQUARE, DEPTH, CURVATURE, INDEX = (U(ROOM * i) for i in range(9, 15))
 PLANES = 15
@@ -36,8 +36,8 @@ def look(
     1). lens: (2,) c_x, c_y. before: (F, 3) float64, distance along the normal and the indices on both sides, of the
     faces up to the caps', which is the last. caps: (N, 6) float64 centre in the panel frame, contact radius squared,
     depth of the sphere's centre, 1 / its radius, index. later: (F, 3) thickness before a face and the indices on both
-    sides. grid: see `whose`. to_image: (3, 3) from the panel frame. view: (4,) c_x, c_y, distance of the last face, 1 / depth. clear:
-    (M,) float64 what reaches each pixel through the bare panels.
+    sides. grid: see `whose`. to_image: (3, 3) from the panel frame. view: (4,) c_x, c_y, distance of the last face,
+    1 / depth. clear: (M,) float64 what reaches each pixel through the bare panels.
     """
     rays = np.zeros(PLANES * ROOM, np.float64)
     count = U(side * side)
@@ -80,21 +80,22 @@ def start(
     rays: Any, u: Any, v: Any, side: Any, pixel: Any, many: Any, directions: Any, to_panel: Any, lens: Any, before: Any
 ) -> None:
     """Rays of a pixel up to the caps' face, standing on it, before it; `LIT` where they meet the panels."""
-    per, count = 1.0 / side, U(side * side)
+    per = 1.0 / side
     for i in range(side):
         for j in range(side):
-            ray = U(i * side + j)
+            at = U(i * side + j)
             # places as the tracer has them, in single precision
             x = float(np.float32(u) + np.float32((j + 0.5) * per - 0.5)) - lens[0]
             y = float(np.float32(v) + np.float32((i + 0.5) * per - 0.5)) - lens[1]
-            rays[KX + ray] = to_panel[0, 0] * x + to_panel[0, 1] * y + to_panel[0, 2]
-            rays[KY + ray] = to_panel[1, 0] * x + to_panel[1, 1] * y + to_panel[1, 2]
-            rays[KZ + ray] = to_panel[2, 0] * x + to_panel[2, 1] * y + to_panel[2, 2]
+            rays[KX + at] = to_panel[0, 0] * x + to_panel[0, 1] * y + to_panel[0, 2]
+            rays[KY + at] = to_panel[1, 0] * x + to_panel[1, 1] * y + to_panel[1, 2]
+            rays[KZ + at] = to_panel[2, 0] * x + to_panel[2, 1] * y + to_panel[2, 2]
     if directions.size:
-        for ray in range(count):
-            at = ray * many + pixel
-            rays[KX + ray], rays[KY + ray], rays[KZ + ray] = directions[0, at], directions[1, at], directions[2, at]
-    for ray in range(count):
+        for ray in range(U(side * side)):
+            place = ray * many + pixel
+            rays[KX + ray], rays[KY + ray] = directions[0, place], directions[1, place]
+            rays[KZ + ray] = directions[2, place]
+    for ray in range(U(side * side)):
         kx, ky, kz = rays[KX + ray], rays[KY + ray], rays[KZ + ray]
         scale = 1 / math.sqrt(kx * kx + ky * ky + kz * kz)
         kx, ky, kz = kx * scale, ky * scale, kz * scale
@@ -106,7 +107,7 @@ def start(
         rays[X + ray], rays[Y + ray], rays[PASSED + ray] = step * kx, step * ky, 1.0
     for face in range(len(before) - 1):
         n1, n2, thick = before[face, 1], before[face, 2], before[face + 1, 0] - before[face, 0]
-        for ray in range(count):
+        for ray in range(U(side * side)):
             kz = rays[KZ + ray]
             turned = math.sqrt(max(kz * kz + (n2 * n2 - n1 * n1), 1e-30))
             rays[PASSED + ray] *= share(kz, turned, n1, n2)

@@ -8,7 +8,8 @@ import numpy as np
 
 from .compile import compiled, inlined
 from .exchange import exchange
-from .window_sums import TOGETHER, add, correlate, points
+from .in_common import common_of, rows_of
+from .window_sums import TOGETHER, WIDE, add, correlate, points
 
 U = np.uint64
 FAR = np.float32(np.inf)
@@ -17,37 +18,35 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 @compiled
 def choose(
-    lags: Any, gram: Any, variance: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int, fewer: int,
-    rounds: int, gain: float, negative: float, ridge: float, grows: float, around: int, first: Any, rays: Any,
-    most_points: int, fine: Any, dense: Any, last: Any, mirrored: bool, texel: Any, weight: Any, counts: Any,
+    lags: Any, pairs: Any, begin: Any, variance: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int,
+    fewer: int, rounds: int, gain: float, negative: float, ridge: float, grows: float, around: int, first: Any,
+    rays: Any, most_points: int, fine: Any, dense: Any, last: Any, mirrored: bool, texel: Any, weight: Any, counts: Any,
 ) -> None:  # fmt: skip
     """Write texels and their weights, (M, MOST) int64, float64, and how many, (M,).
 
-    lags, gram: `rain.pursuit._Dictionary`; variance: (A,) float32, gram's diagonal. atoms: (A, 3) int64 shape, column
-    and row of each texel of a window, those of the window's own first. shapes: (S, 5) int64 halvings across and down,
-    width, height and first number of the copy, which is empty if none is offered. price, least: (A,) float32: what a
-    texel must be worth, and what must be news of its variance. After so many texels (`screened`) only `fewer` others,
-    those worth most then, are offered. rounds, gain: see `rain.exchange`.
-    negative, ridge, grows: what weights below 0 may add up to, and what their square sum costs, more and more, where it is more. around: texels around the rays that are near. first: (2, M)
-    column and row of the windows. rays, most_points, fine, dense, last, mirrored: see `points`; rays are those of all
-    pixels, (M, 7, K).
+    lags: `rain.pursuit._Dictionary`. pairs, begin: see `common_of`; variance: (A,) float32 of texels. atoms: (A, 3)
+    int64 shape, column and row of each texel of a window, those of the window's own first. shapes: (S, 5) int64
+    halvings across and down, width, height and first number of the copy, which is empty if none is offered. price,
+    least: (A,) float32: what a texel must be worth, and what must be news of its variance. After so many texels
+    (`screened`) only `fewer` others, those worth most then, are offered. rounds, gain: see `rain.exchange`. negative,
+    ridge, grows: what weights below 0 may add up to, and what their square sum costs, more and more, where it is more.
+    around: texels around the rays that are near. first: (2, M) column and row of the windows. rays, most_points, fine,
+    dense, last, mirrored: see `points`; rays are those of all pixels, (M, 7, K).
     """
     size, most, room = U(len(atoms)), U(texel.shape[1]), rays.shape[2] * most_points**2 + TOGETHER
     side = U(lags.shape[2] + 1) // U(2)
-    along, common, wide = (
-        np.zeros(size, np.float32),
-        np.zeros((side, side), np.float32),
-        np.empty(side * side, np.float32),
-    )
+    along, common = np.zeros(size, np.float32), np.zeros((side, side), np.float32)
+    wide = np.empty(side * side, np.float32)
     columns, rest, news = np.empty(size, np.uint32), np.empty(size, np.float32), np.empty(size, np.float32)
     cost, low, score = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    base, bases = np.empty(size, np.float32), np.empty((most, size), np.float32)
+    base, bases = np.empty(size + U(WIDE), np.float32), np.empty((most, size), np.float32)
+    rects = np.zeros((len(shapes), 4), np.int64)
     taken, between, box = np.empty(most, np.uint64), np.empty((most, most), np.float64), np.empty(4, np.int64)
     x, y, share = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     u, v, starts = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
     factor, free, even = np.empty((most, most), np.float64), np.empty(most, np.float64), np.empty(most, np.float64)
     inverse, inner = np.empty((most, most)), np.empty(most)
-    lines, wide_room = np.empty((2, most, size)), np.empty((4, size))
+    lines, spare = np.empty((2, most, size)), np.empty((4, size))
     for pixel in range(U(len(rays))):
         column, row = first[U(0), pixel], first[U(1), pixel]
         lit, total = points(
@@ -56,10 +55,12 @@ def choose(
         )  # fmt: skip
         correlate(lags, u, v, share, lit, box, starts, common, wide)
         add(common, shapes, along)
-        there = offer(shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low)
+        there = offer(
+            shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low, rects
+        )
         for i in range(there):
             score[i] = rest[i] * rest[i] / (news[i] * cost[i])
-        count = U(0)
+        count, fewer_left = U(0), False
         for number in range(most):
             best = highest(score, there)
             if best == there or (number > U(0) and not score[best] > 1):
@@ -69,20 +70,29 @@ def choose(
             count += U(1)
             if number == U(screened) and there > U(fewer):
                 there = screen(score, U(fewer), number, there, rest, news, cost, low, columns, bases)
-                best = U(0)
+                best, fewer_left = U(0), True
                 while U(columns[best]) != chosen:
                     best += U(1)
-            for i in range(there):
-                base[i] = gram[chosen, columns[i]]
+            own = atoms[chosen]
+            if number < U(screened) or not fewer_left:
+                rows_of(pairs, begin, shapes, side, own, rects, base)
+            else:
+                for i in range(there):
+                    base[i] = common_of(pairs, begin, shapes, side, own, atoms[columns[i]])
             orthogonal(base, bases, number, best, there)
             go_on(base, bases[number], rest, news, cost, low, score, best, there)
-        there = offer(shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low)
+        there = offer(
+            shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low, rects
+        )
         count = exchange(
-            gram, along, price, least, columns, there, rounds, gain, taken, count, inverse, inner, lines, wide_room
+            pairs, begin, shapes, side, atoms, along, variance, price, least, columns, there, rects, rounds, gain,
+            taken, count, inverse, inner, lines, spare, base,
         )  # fmt: skip
         for number in range(count):
             for before in range(number + U(1)):
-                between[number, before] = gram[taken[number], taken[before]]
+                between[number, before] = common_of(
+                    pairs, begin, shapes, side, atoms[taken[number]], atoms[taken[before]]
+                )
         toll = 0.0
         while True:
             solve(between, along, taken, count, total, toll, factor, free, even, weight[pixel])
@@ -106,9 +116,12 @@ def choose(
 @inlined
 def offer(
     shapes: Any, side: Any, column: Any, row: Any, box: Any, along: Any, variance: Any, price: Any, least: Any,
-    columns: Any, rest: Any, news: Any, cost: Any, low: Any,
+    columns: Any, rest: Any, news: Any, cost: Any, low: Any, rects: Any,
 ) -> Any:  # fmt: skip
-    """Write what is known of the texels that the image has and a box meets; returns how many."""
+    """Write what is known of the texels that the image has and a box meets; returns how many.
+
+    rects: (S, 4) of each shape the first and last column and row of these.
+    """
     there, start, last = U(0), np.int64(0), np.int64(side) - 1
     for shape in range(U(len(shapes))):
         across, down = shapes[shape, U(0)], shapes[shape, U(1)]
@@ -116,6 +129,7 @@ def offer(
         left, top = max(box[0], 0) >> across, max(box[2], 0) >> down
         right = min(min(box[1], last) >> across, shapes[shape, U(2)] - 1 - (column >> across))
         bottom = min(min(box[3], last) >> down, shapes[shape, U(3)] - 1 - (row >> down))
+        rects[shape, U(0)], rects[shape, U(1)], rects[shape, U(2)], rects[shape, U(3)] = left, right, top, bottom
         for k in range(top, bottom + 1):
             begin = U(start + k * width)
             for i in range(begin + U(left), begin + U(max(right + 1, left))):

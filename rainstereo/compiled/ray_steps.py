@@ -23,7 +23,7 @@ def brought_in(
     x: Any, y: Any, weights: Any, last_x: Any, last_y: Any, mirrored: bool, jump: Any, loose: Any, found: Any,
     span: Any, is_loose: Any,
 ) -> None:  # fmt: skip
-    """Write places, and steps in x and y to the next ray right and below, found: (6, K, M) float32; and `span_of`, (M,).
+    """Write places, and steps in x and y to the next ray right and below, found: (6, K, M) float32; and spans, (M,).
 
     x, y, weights: (K, M) float32. last_x, last_y: of the image. jump: 1 / `rain.quadtree.JUMP`. is_loose: (M,) bool,
     see `Quadtree.is_loose`, with `LOOSE`.

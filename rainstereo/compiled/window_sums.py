@@ -24,10 +24,10 @@ REALS = ir.VectorType(REAL, WIDE)
 def _sweep(
     _context: Any, table: Any, starts: Any, weights: Any, _first: Any, _high: Any, _wide: Any, _apart: Any, sums: Any
 ) -> Any:
-    """sweep(table, starts, weights, first, high, wide, apart, sums): add 8 weighted parts of a table to high x wide sums.
+    """sweep(table, starts, weights, first, high, wide, apart, sums): add 8 parts of a table, weighted, to sums.
 
-    The parts begin where `starts` says, from `first` on; their rows are so far (apart) from one another. wide: a
-    multiple of 8. One loop, in which the compiler knows that sums are not part of the rest.
+    The parts are high x wide; they begin where `starts` says, from `first` on, and their rows are so far (apart) from
+    one another. wide: a multiple of 8. One loop, in which the compiler knows that sums are not part of the rest.
     """
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
@@ -63,7 +63,32 @@ def _sweep(
     return types.void(table, starts, weights, number, number, number, number, sums), code
 
 
+@intrinsic
+def _copy(_context: Any, source: Any, _first: Any, target: Any, _at: Any, _count: Any) -> Any:
+    """copy(source, first, target, at, count): so many numbers, and up to 7 more that are written over next."""
+
+    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        data, first, to, at, count = (
+            context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
+            for kind, value in zip(signature.args, given, strict=True)
+        )
+        rounds = builder.udiv(builder.add(count, LONG(WIDE - 1)), LONG(WIDE))
+        with cgutils.for_range(builder, rounds, intp=LONG) as loop:
+            done = builder.mul(loop.index, LONG(WIDE))
+            values = builder.load(
+                builder.bitcast(builder.gep(data, [builder.add(first, done)]), REALS.as_pointer()), align=4
+            )
+            builder.store(
+                values, builder.bitcast(builder.gep(to, [builder.add(at, done)]), REALS.as_pointer()), align=4
+            )
+        return context.get_dummy_value()
+
+    number = types.uint64
+    return types.void(source, number, target, number, number), code
+
+
 sweep: Any = _sweep
+copy: Any = _copy
 
 
 @inlined
@@ -147,7 +172,7 @@ def correlate(lags: Any, u: Any, v: Any, share: Any, lit: Any, box: Any, starts:
     u, v, share: columns, rows and weights of `lit` points, with room for `TOGETHER` more, as has starts, int32. wide:
     (side^2,) float32.
     """
-    side, apart = U(len(common)), U(lags.shape[2])
+    apart = U(lags.shape[2])
     last = len(common) - 1
     left, right = U(max(box[0], 0) & -8), U(min(box[1], last) | 7) + U(1)
     top, bottom = U(max(box[2], 0) & -8), U(min(box[3], last) | 7) + U(1)

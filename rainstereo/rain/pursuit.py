@@ -63,7 +63,7 @@ and whole objects; what errors there count for."""
 AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
 POINTS_ALONG, MOST_ALONG = 32, 4
 """Points along a pixel's side that rays stand for, each for its part, and along such a part, at most."""
-DENSE = 2.5
+DENSE = 4.0
 """Such points a texel of the window, along each side of a ray's part of the pixel."""
 
 
@@ -180,7 +180,8 @@ class Pursuit:
             j, i = (np.clip(at, 0, places - 1).astype(np.intp) for at in (j, i))
             bins[part] = i * places + j
             shares[part] = np.where((m < across) & (n < down), weights / (across * down), 0)
-        where, share = (values.T.reshape(count, -1) for values in (bins, shares))
+        where: Indices = bins.T.reshape(count, -1)
+        share: Image = shares.T.reshape(count, -1)
         common = _common(words, where, share)
         offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
@@ -201,11 +202,11 @@ class Pursuit:
         weight: Array = np.zeros((count, MOST))
         counts: Indices = np.zeros(count, dtype=np.intp)
         shapes = np.array([(*shape, *self._limits(level, shape)) for shape in SHAPES], dtype=np.int64)
-        variance, scale = np.ascontiguousarray(np.diag(words.gram)), 0.5**level
+        (pairs, begin, variance), scale = words.pairs, 0.5**level
         last = tuple(np.float32(n - 1) for n in self.size)
         rays = np.stack([x.T, y.T, *(step.T for step in steps), weights.T], axis=1)
         choose(
-            words.lags, words.gram, variance, _atoms(), shapes, self._prices(level), np.float32(FRESH) * variance,
+            words.lags, pairs, begin, variance, _atoms(), shapes, self._prices(level), np.float32(FRESH) * variance,
             SCREENED, OFFERED, ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each,
             np.float32(BINS * scale), np.float32(DENSE * scale), last, self.tree.border == "mirror", texel, weight,
             counts,
@@ -260,13 +261,38 @@ def _boxes(where: Indices, share: Array) -> Indices:
 
 @dataclass(frozen=True, eq=False)
 class _Dictionary:
-    """What texels of a window have in common. gram: (A, A) of texels with one another. Square gray levels.
+    """What texels of a window have in common. Square gray levels.
 
     lags: (2, 2, n, n) of a place with a texel so far away, even and odd steps of `BINS` apart; the last place first.
+    own: (2 side - 1, 2 side - 1) of the window's own texels that are so far apart, the nearest in the middle.
     """
 
     lags: Image
-    gram: Image
+    own: Array
+
+    @cached_property
+    def gram(self) -> Image:
+        """(A, A) float32 of texels with one another."""
+        lag = np.arange(SIDE) - np.arange(SIDE)[:, None] + SIDE - 1
+        base = self.own[lag[:, None, :, None], lag[None, :, None, :]].reshape(SIDE**2, SIDE**2)
+        whole = _sums(base.reshape(-1, SIDE, SIDE))
+        return _sums(np.ascontiguousarray(whole.T).reshape(-1, SIDE, SIDE)).astype(np.float32)
+
+    @cached_property
+    def pairs(self) -> tuple[Image, Indices, Image]:
+        """The same by how far texels are apart, and where each pair of shapes begins, see `compiled.pursuit.common_of`;
+        and the texels' variances, (A,)."""
+        tables, begin, variances = [], np.zeros((len(SHAPES),) * 2, dtype=np.int64), []
+        total = 0
+        for i, one in enumerate(SHAPES):
+            for j, other in enumerate(SHAPES):
+                (across, down), begin[i, j] = map(_distances, one, other), total
+                tables.append((down @ self.own @ across.T).astype(np.float32).ravel())
+                total += tables[-1].size
+            (x, y) = map(_together, one, one)
+            variances.append(float(y @ self.own @ x))
+        tables.append(np.zeros(2 * SIDE, dtype=np.float32))  # a loop may read a little more
+        return np.concatenate(tables), begin, np.array(variances, dtype=np.float32)[_atoms()[:, 0]]
 
     @cached_property
     def of_bins(self) -> Image:
@@ -275,6 +301,27 @@ class _Dictionary:
         odd, step = place % BINS, SIDE - 1 - place[:, None] // BINS + cell
         table = self.lags[odd[:, None, None, None], odd[:, None, None], step[:, None, :, None], step[None, :, None]]
         return np.asarray(table.reshape(len(place) ** 2, SIDE**2))
+
+
+def _together(one: int, other: int, apart: int = 0) -> Array:
+    """How often parts of two texels of so many halvings, the other so far beside the one, are how far apart: a share
+    for each of the 2 `SIDE` - 1 distances, of those that there are in a window."""
+    first, second = np.arange(1 << one), np.arange(1 << other)
+    lag = np.clip(apart + second - first[:, None] + SIDE - 1, 0, 2 * SIDE - 2)
+    return np.bincount(lag.ravel(), minlength=2 * SIDE - 1) / lag.size
+
+
+@cache
+def _distances(one: int, other: int) -> Array:
+    """`_together` for each phase of a texel in the grid of the other, and each distance along it, one in each row."""
+    phases, cells = 1 << max(other - one, 0), SIDE >> other
+    return np.stack(
+        [
+            _together(one, other, (step << other) + (phase << one))
+            for phase in range(phases)
+            for step in range(-cells, cells)
+        ]
+    )
 
 
 @cache
@@ -288,16 +335,11 @@ def _dictionary(level: int) -> _Dictionary:
     split = of_places.reshape(len(away) // BINS, BINS, len(away) // BINS, BINS)
     lags = np.ascontiguousarray(np.moveaxis(split, (1, 3), (0, 1))[:, :, ::-1, ::-1])
     between = (inside[:, None] - inside).reshape(-1, 2)
-    own = _covariance(scene, np.arange(1.0 - SIDE, SIDE), between, texel)
-    lag = np.arange(SIDE) - np.arange(SIDE)[:, None] + SIDE - 1
-    base = own[lag[:, None, :, None], lag[None, :, None, :]].reshape(SIDE**2, SIDE**2)
-    whole = _sums(base.reshape(-1, SIDE, SIDE))
-    gram = _sums(np.ascontiguousarray(whole.T).reshape(-1, SIDE, SIDE))
-    return _Dictionary(lags, gram.astype(np.float32))
+    return _Dictionary(lags, _covariance(scene, np.arange(1.0 - SIDE, SIDE), between, texel))
 
 
 def forget() -> None:
-    """Give up what is tabulated of windows, 14 MB for each level; it is found anew when it is needed."""
+    """Give up what is tabulated of windows, 14 MB for each level without numba; it is found anew when it is needed."""
     _dictionary.cache_clear()
 
 

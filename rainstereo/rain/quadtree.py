@@ -96,12 +96,14 @@ class Quadtree:
             return x, y, steps, span, self.is_loose(span, steps, weights)
         from rainstereo.compiled.ray_steps import brought_in as swept
 
+        x, y, weights = (np.ascontiguousarray(each) for each in (x, y, weights))  # one kind of array: compiled once
         found: Image = np.empty((6, *weights.shape), dtype=np.float32)
         span, loose = np.empty(weights.shape[1], dtype=np.float32), np.zeros(weights.shape[1], dtype=np.bool_)
-        last = [np.float32(n - 1) for n in self.size]
+        right, bottom = (np.float32(n - 1) for n in self.size)
         swept(
-            x, y, weights, *last, self.border == "mirror", np.float32(1 / JUMP), np.float32(LOOSE), found, span, loose
-        )
+            x, y, weights, right, bottom, self.border == "mirror", np.float32(1 / JUMP), np.float32(LOOSE), found, span,
+            loose,
+        )  # fmt: skip
         a, b, across_x, across_y, down_x, down_y = found
         return a, b, (across_x, across_y, down_x, down_y), span, loose
 
@@ -133,6 +135,8 @@ class Quadtree:
     def _together(self, x: Array, y: Array, weights: Array, steps: Steps, span: Array, side: int) -> Taps:
         count = weights.shape[1]
         level, column, row = self._window(x, y, weights, span)
+        if compiled.available():
+            return self._merged(x, y, weights, steps, (level, column, row), side)
         scale = np.exp2(-level.astype(np.float32))
         own = [
             (at + np.float32(0.5)) * scale - (first + 0.5).astype(np.float32) for at, first in ((x, column), (y, row))
@@ -163,6 +167,29 @@ class Quadtree:
         wide = np.array([size[0] for size in sizes(self.size)])
         texel = np.array(starts(self.size))[of_level] + i * wide[of_level] + j
         return whole(pixel, texel, weight, count, error)
+
+    def _merged(
+        self, x: Array, y: Array, weights: Array, steps: Steps, window: tuple[Indices, Indices, Indices], side: int
+    ) -> Taps:
+        """The same by a loop in machine code."""
+        from rainstereo.compiled.merged_cells import merge
+
+        count, of_level = weights.shape[1], sizes(self.size)
+        most = count * side * side
+        texel: Indices = np.empty(most, dtype=np.int64)
+        weight: Image = np.empty(most, dtype=np.float32)
+        counts: Indices = np.zeros(count, dtype=np.int64)
+        error: Array = np.zeros(count)
+        wide, high = (np.array([size[i] for size in of_level], dtype=np.int64) for i in (0, 1))
+        uneven = unevenness(len(of_level)).astype(np.float32)
+        prices = np.float32(self.worth), np.float32(DEAR * self.worth)
+        rays = (np.ascontiguousarray(each) for each in (x, y, weights, *steps))  # one kind of array: compiled once
+        merge(
+            *rays, *window, _order(side), _all_places(side), MERGES, side, uneven, *prices, FEW,
+            np.array(starts(self.size), dtype=np.int64), wide, high, texel, weight, counts, error,
+        )  # fmt: skip
+        made = int(counts.sum())
+        return whole(np.repeat(np.arange(count), counts), texel[:made], weight[:made], count, error)
 
     def _place(
         self, cell: Indices, merge: int, side: int, level: Indices, column: Indices, row: Indices
@@ -231,6 +258,15 @@ def _places(side: int) -> list[tuple[Any, Any]]:
         by_number = np.argsort(cells, axis=None)
         row, column = np.divmod(by_number, side >> merge)
         found.append((column, row))
+    return found
+
+
+@cache
+def _all_places(side: int) -> Indices:
+    """The same in one array, (merges + 1, 2, side^2) int64; what there is no cell for is 0."""
+    found = np.zeros((MERGES + 1, 2, side * side), dtype=np.int64)
+    for merge, (column, row) in enumerate(_places(side)):
+        found[merge, 0, : len(column)], found[merge, 1, : len(row)] = column, row
     return found
 
 

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rainstereo import compiled
 from rainstereo.rain import exchange
 from rainstereo.rain.exchange import GAIN, exchanged
 
@@ -94,27 +93,3 @@ def test_few_rounds_and_few_texels():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exchange, "ROUNDS", 0)
         np.testing.assert_array_equal(exchanged(gram, along, offered, dear, least, taken, counts)[0], taken)
-
-
-@pytest.mark.skipif(not compiled.available(), reason="numba is not installed (extra fast)")
-@pytest.mark.parametrize("worth", [0.3, 4.0])
-def test_compiled_as_not(worth):
-    from rainstereo.compiled.exchange import exchange as loop
-
-    gram, along, _, offered = problem(5, 80, 60)
-    rng = np.random.default_rng(6)
-    price = (worth * rng.choice([1.0, 1.5], len(gram))).astype(np.float32)
-    least = np.float32(1e-4) * np.diag(gram)
-    taken, counts = starts(along, offered, rng)
-    found, made = exchanged(gram, along, offered, price, least, taken, counts)
-    room = np.empty((MOST, MOST)), np.empty(MOST), np.empty((2, MOST, len(gram))), np.empty((4, len(gram)))
-    for row, count in enumerate(counts.tolist()):
-        own = taken[row].astype(np.uint64)
-        columns = np.flatnonzero(offered[row]).astype(np.uint32)
-        last = loop(
-            gram, along[row], price, least, columns, np.uint64(len(columns)), exchange.ROUNDS, GAIN, own,
-            np.uint64(count), *room,
-        )  # fmt: skip
-        assert last == made[row]
-        np.testing.assert_array_equal(own[: int(last)], found[row, : made[row]])
-    assert (made != counts).any()

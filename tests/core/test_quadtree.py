@@ -154,6 +154,31 @@ def test_rays_are_placed_compiled_as_not(border, side, count, monkeypatch):
     assert side < 8 or count == 0 or 0 < np.count_nonzero(ours[4]) < count
 
 
+@pytest.mark.skipif(not compiled.available(), reason="numba is not installed")
+@pytest.mark.parametrize("border", ["mirror", "edge"])
+@pytest.mark.parametrize(
+    ("side", "count", "extent", "worth", "apart"),
+    [(8, 300, 17, 0.003, 0.4), (8, 300, 17, 0.3, 8), (4, 90, 9, 0.05, 2), (2, 70, 5, 1.0, 30), (16, 20, 33, 0.01, 1)],
+)
+def test_cells_are_merged_compiled_as_not(border, side, count, extent, worth, apart, monkeypatch):
+    """To the last bit: within texels and over dozens of them."""
+    rng, along = np.random.default_rng(1), np.arange(side)
+    x, y = (
+        (centre + right * np.tile(along, side)[:, None] + down * np.repeat(along, side)[:, None]).astype(np.float32)
+        for centre, right, down in zip(
+            rng.uniform(-50, 250, (2, count)), *rng.normal(0, apart, (2, 2, count)), strict=True
+        )
+    )
+    weights = (rng.random(x.shape) * (rng.random(x.shape) < 2 * rng.random(count)) / side**2).astype(np.float32)
+    tree = Quadtree(SIZE, extent, worth, border)
+    ours = tree.taps(x, y, weights)
+    monkeypatch.setattr(compiled, "available", lambda: False)
+    plain = tree.taps(x, y, weights)
+    for name in ("counts", "texels", "weights"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name), name)
+    np.testing.assert_allclose(ours.error, plain.error, rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("border", ["mirror", "edge"])
 def test_rays_are_brought_in_with_their_steps(border):
     """A point a little beside a ray falls, in the image, where the step that it has there leads to."""
