@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba.core import cgutils, types
+from numba.core import types
 from numba.extending import intrinsic
 
 from .layout import LANES, LONG_BITS, SHORT_BITS
+from .llvm import BYTE, FOUR, LONG, TWO, alike, arguments, ir, load, spread, store
 
-ir: Any = vars(cgutils)["ir"]  # of llvmlite, which numba brings along
-BYTE, TWO, FOUR, LONG = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 VECTOR = ir.VectorType(FOUR, LANES)
 LAST = 255
 
@@ -28,11 +27,7 @@ def _summing(channels: int) -> Any:
         roundings: Any,
     ) -> Any:  # fmt: skip
         def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            data = [
-                context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
-                for kind, value in zip(signature.args, given, strict=True)
-            ]
-            _write(builder, channels, *data)
+            _write(builder, channels, *arguments(context, builder, signature, given))
             return context.get_dummy_value()
 
         number = types.uint64
@@ -47,14 +42,14 @@ def _write(
 ) -> None:  # fmt: skip
     of_tap = taps.type.pointee
     bits = SHORT_BITS if of_tap == FOUR else LONG_BITS  # known here, so that weights are known to have 16 bits at most
-    low, high = ir.Constant(of_tap, (1 << bits) - 1), ir.Constant(ir.VectorType(of_tap, LANES), [bits] * LANES)
-    start = _vector(builder, roundings, row, VECTOR)
+    low, high = ir.Constant(of_tap, (1 << bits) - 1), alike(ir.VectorType(of_tap, LANES), bits)
+    start = load(builder, roundings, row, VECTOR)
     before, loop, after = builder.block, builder.append_basic_block("tap"), builder.append_basic_block("write")
     builder.branch(loop)
 
     builder.position_at_end(loop)  # one tap of each pixel: quads are fetched one by one, and weighted together
     tap, sums = builder.phi(LONG), [builder.phi(VECTOR) for _ in range(channels)]
-    weights = builder.ashr(_vector(builder, taps, tap, ir.VectorType(of_tap, LANES)), high)
+    weights = builder.ashr(load(builder, taps, tap, ir.VectorType(of_tap, LANES)), high)
     if of_tap != FOUR:
         weights = builder.trunc(weights, VECTOR)
     found = ir.Constant(VECTOR, ir.Undefined)
@@ -64,7 +59,7 @@ def _write(
         found = builder.insert_element(found, builder.load(builder.gep(quads, [place])), ir.Constant(FOUR, lane))
     added = []
     for channel, total in enumerate(sums):
-        values = builder.and_(builder.lshr(found, _all(8 * channel)), _all(LAST))
+        values = builder.and_(builder.lshr(found, alike(VECTOR, 8 * channel)), alike(VECTOR, LAST))
         added.append(builder.add(total, builder.mul(values, weights)))
     following = builder.add(tap, ir.Constant(LONG, LANES))
     builder.cbranch(builder.icmp_unsigned("<", following, end), loop, after)
@@ -75,32 +70,16 @@ def _write(
         total.add_incoming(new, loop)
 
     builder.position_at_end(after)  # whole gray levels from 0 to 255, side by side again
-    shown, unit = _all(0), _spread(builder, shift)
+    shown, unit = alike(VECTOR, 0), spread(builder, shift, VECTOR)
     for channel, total in enumerate(added):
         level = builder.ashr(total, unit)
-        level = builder.select(builder.icmp_signed(">", level, _all(0)), level, _all(0))
-        level = builder.select(builder.icmp_signed("<", level, _all(LAST)), level, _all(LAST))
-        shown = builder.or_(shown, builder.shl(level, _all(8 * channel)))
+        level = builder.select(builder.icmp_signed(">", level, alike(VECTOR, 0)), level, alike(VECTOR, 0))
+        level = builder.select(builder.icmp_signed("<", level, alike(VECTOR, LAST)), level, alike(VECTOR, LAST))
+        shown = builder.or_(shown, builder.shl(level, alike(VECTOR, 8 * channel)))
     for lane in range(LANES):
         pixel = builder.zext(builder.load(builder.gep(pixels, [builder.add(row, ir.Constant(LONG, lane))])), LONG)
         at = builder.gep(out, [builder.mul(pixel, ir.Constant(LONG, channels))])
         _store(builder, builder.extract_element(shown, ir.Constant(FOUR, lane)), at, channels)
-
-
-def _all(value: int) -> Any:
-    """A vector of so many times the same number."""
-    return ir.Constant(VECTOR, [value] * LANES)
-
-
-def _spread(builder: Any, value: Any) -> Any:
-    """The same of a number that is not known yet."""
-    nothing = ir.Constant(VECTOR, ir.Undefined)
-    return builder.shuffle_vector(builder.insert_element(nothing, value, ir.Constant(FOUR, 0)), nothing, _all(0))
-
-
-def _vector(builder: Any, data: Any, at: Any, kind: Any) -> Any:
-    place = builder.bitcast(builder.gep(data, [at]), kind.as_pointer())
-    return builder.load(place, align=kind.element.width // 8)
 
 
 def _store(builder: Any, value: Any, at: Any, channels: int) -> None:
@@ -110,8 +89,7 @@ def _store(builder: Any, value: Any, at: Any, channels: int) -> None:
         if channels - written >= count:
             part = builder.lshr(value, ir.Constant(FOUR, 8 * written)) if written else value
             part = part if kind is FOUR else builder.trunc(part, kind)
-            place = builder.bitcast(builder.gep(at, [ir.Constant(LONG, written)]), kind.as_pointer())
-            builder.store(part, place, align=1)
+            store(builder, part, at, ir.Constant(LONG, written))
             written += count
 
 

@@ -10,13 +10,12 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from .compile import inlined
+from .llvm import LONG, REAL, arguments, ir, load, spread, store
 
 U = np.uint64
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
-ir: Any = vars(cgutils)["ir"]  # of llvmlite, which numba brings along
 WIDE = 8  # numbers side by side
 TOGETHER = 8  # points that are added in one sweep
-LONG, REAL = ir.IntType(64), ir.FloatType()
 REALS = ir.VectorType(REAL, WIDE)
 
 
@@ -31,32 +30,24 @@ def _sweep(
     """
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        rows, begin, factors, first, high, wide, apart, total = (
-            context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
-            for kind, value in zip(signature.args, given, strict=True)
-        )
-
-        def eight(data: Any, place: Any) -> Any:
-            return builder.bitcast(builder.gep(data, [place]), REALS.as_pointer())
-
-        nothing, same = ir.Constant(REALS, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), WIDE), [0] * WIDE)
+        rows, begin, factors, first, high, wide, apart, total = arguments(context, builder, signature, given)
         parts = []
         for point in range(TOGETHER):
             number = builder.add(first, LONG(point))
             start = builder.zext(builder.load(builder.gep(begin, [number])), LONG)
-            factor = builder.insert_element(nothing, builder.load(builder.gep(factors, [number])), ir.IntType(32)(0))
-            parts.append((builder.gep(rows, [start]), builder.shuffle_vector(factor, nothing, same)))
+            factor = builder.load(builder.gep(factors, [number]))
+            parts.append((builder.gep(rows, [start]), spread(builder, factor, REALS)))
         with (
             cgutils.for_range(builder, high, intp=LONG) as row,
             cgutils.for_range(builder, builder.udiv(wide, LONG(WIDE)), intp=LONG) as block,
         ):
             across = builder.mul(block.index, LONG(WIDE))
-            place = eight(total, builder.add(builder.mul(row.index, wide), across))
+            place = builder.add(builder.mul(row.index, wide), across)
             skip = builder.add(builder.mul(row.index, apart), across)
-            added = builder.load(place, align=4)
+            added = load(builder, total, place, REALS)
             for data, factor in parts:  # one after the other, rounded as numpy does
-                added = builder.fadd(added, builder.fmul(builder.load(eight(data, skip), align=4), factor))
-            builder.store(added, place, align=4)
+                added = builder.fadd(added, builder.fmul(load(builder, data, skip, REALS), factor))
+            store(builder, added, total, place)
         return context.get_dummy_value()
 
     number = types.uint64
@@ -68,19 +59,11 @@ def _copy(_context: Any, source: Any, _first: Any, target: Any, _at: Any, _count
     """copy(source, first, target, at, count): so many numbers, and up to 7 more that are written over next."""
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        data, first, to, at, count = (
-            context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
-            for kind, value in zip(signature.args, given, strict=True)
-        )
+        data, first, to, at, count = arguments(context, builder, signature, given)
         rounds = builder.udiv(builder.add(count, LONG(WIDE - 1)), LONG(WIDE))
         with cgutils.for_range(builder, rounds, intp=LONG) as loop:
             done = builder.mul(loop.index, LONG(WIDE))
-            values = builder.load(
-                builder.bitcast(builder.gep(data, [builder.add(first, done)]), REALS.as_pointer()), align=4
-            )
-            builder.store(
-                values, builder.bitcast(builder.gep(to, [builder.add(at, done)]), REALS.as_pointer()), align=4
-            )
+            store(builder, load(builder, data, builder.add(first, done), REALS), to, builder.add(at, done))
         return context.get_dummy_value()
 
     number = types.uint64
