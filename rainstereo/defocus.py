@@ -48,6 +48,7 @@ SHARP = 1.0  # pixels; a smaller disc blurs no more than a pixel does
 SAME = 1.1  # ratio of discs up to which one serves all
 CELL = 16  # points along a cell's side that decide how much of it a disc covers
 COARSEST = 8  # pixels of the image averaged, along a side, before samples are taken
+MANY = 1 << 21  # samples whose channels are summed one by one, for memory's sake
 FAINT = 1e-5  # opacity below which there is nothing
 Tracer = Callable[[tuple[slice, slice], float], Patch]
 
@@ -89,8 +90,12 @@ class DefocusedPatch:
         colour: Image = np.zeros((*self._shape, *image.shape[2:]), dtype=np.float32)
         for tables, kernel in zip(self._tables, self._kernels, strict=True):
             found = cv2.remap(reduced, *tables, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            sampled = found.reshape(found.shape[0] * found.shape[1], -1).astype(np.float32)
-            add_blurred(colour, (self._sums @ sampled).reshape(colour.shape), kernel)
+            sampled = found.reshape(found.shape[0] * found.shape[1], -1)
+            if len(sampled) < MANY:
+                sums: Image = self._sums @ sampled.astype(np.float32)
+            else:
+                sums = np.stack([self._sums @ channel.astype(np.float32) for channel in sampled.T], -1)
+            add_blurred(colour, sums.reshape(colour.shape), kernel)
         colour[self._coarse_opacity == 0] = 0
         return Layer(*self._window, self._fine(colour), self._opacity)
 
@@ -104,10 +109,15 @@ class DefocusedPatch:
 
     # -- the plan, made for the first frame ------------------------------------------------------------------------
 
-    @cached_property
+    def let_go(self) -> None:
+        """Give up what was made for frames; if there is another, it is made anew."""
+        for name in ("_sums", "_tables"):
+            self.__dict__.pop(name, None)
+
+    @property
     def _covered(self) -> types.Indices:
         """The samples that a drop covers and that are not dark."""
-        return np.flatnonzero(self.patch.gain * self.patch.opacity)
+        return np.flatnonzero(self.patch.gain * self.patch.opacity).astype(np.int32)
 
     @cached_property
     def _shape(self) -> tuple[int, int]:
@@ -119,11 +129,14 @@ class DefocusedPatch:
         """Sparse matrix from sampled colours to the premultiplied means of the cells that are blurred."""
         columns = self.patch.opacity.shape[1]
         each = columns // self._shape[1]  # samples along a cell's side
-        y, x = np.divmod(self._covered, columns)
-        weight = (self.patch.gain * self.patch.opacity).ravel()[self._covered] / each**2
+        covered = self._covered
+        y, x = np.divmod(covered, columns)
+        weight = (self.patch.gain * self.patch.opacity).ravel()[covered] / each**2
         count = -(-max(1, len(weight)) // ACROSS) * ACROSS
         cell = y // each * self._shape[1] + x // each
-        return csr_array((weight, (cell, np.arange(len(weight)))), (math.prod(self._shape), count), dtype=np.float32)
+        return csr_array(
+            (weight, (cell, np.arange(len(weight), dtype=np.int32))), (math.prod(self._shape), count), dtype=np.float32
+        )
 
     @cached_property
     def _kernels(self) -> list[Array]:
@@ -135,7 +148,8 @@ class DefocusedPatch:
         """For each part of the disc the fixed-point maps of the covered samples into the reduced image."""
         count = self._sums.shape[1]
         source: Image = np.zeros((2, count // ACROSS, ACROSS), dtype=np.float32)
-        source.reshape(2, count)[:, : len(self._covered)] = self.patch.source.reshape(-1, 2)[self._covered].T
+        covered = self._covered
+        source.reshape(2, count)[:, : len(covered)] = self.patch.source.reshape(-1, 2)[covered].T
         tables = []
         for kernel in self._kernels:
             aside = (middle(kernel) * self.spacing * self.shift).astype(np.float32)

@@ -26,6 +26,7 @@ def merge(
     `few`, dear. starts, wide, high: of levels. error: (M,) float64.
     """
     cells, total = np.empty(side * side, np.float64), U(0)
+    lost_all: Any = 0.0
     values, closed = np.empty(side * side, np.float32), np.empty(side * side, np.bool_)
     levels = len(uneven)
     for pixel in range(U(len(level))):
@@ -39,7 +40,7 @@ def merge(
             )  # fmt: skip
         for i in range(side * side):
             values[i], closed[i] = np.float32(cells[i]), False
-        before, lost_all, count = total, 0.0, side * side
+        before, count, lost_all = total, side * side, 0.0
         for step in range(merges + 1):
             at = own + step
             if step < merges:
@@ -80,9 +81,10 @@ def around(x: Any, y: Any, weights: Any, pixel: Any, left: Any, top: Any, side: 
     for corner in range(4):
         for ray in range(U(len(x))):
             share = np.float64(weights[ray, pixel])
-            u = min(max((x[ray, pixel] + HALF) - np.float32(left + 0.5), ZERO), end)
-            v = min(max((y[ray, pixel] + HALF) - np.float32(top + 0.5), ZERO), end)
-            j, i = min(np.int64(u), side - 2), min(np.int64(v), side - 2)
+            u: Any = min(max((x[ray, pixel] + HALF) - np.float32(left + 0.5), ZERO), end)
+            v: Any = min(max((y[ray, pixel] + HALF) - np.float32(top + 0.5), ZERO), end)
+            j: Any = min(np.int64(u), side - 2)
+            i: Any = min(np.int64(v), side - 2)
             a, b = np.float64(u) - j, np.float64(v) - i
             part = (a if corner % 2 else 1 - a) * (b if corner // 2 else 1 - b)
             cells[order[(i + corner // 2) * side + j + corner % 2]] += part * share

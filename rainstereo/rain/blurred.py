@@ -17,6 +17,7 @@ from rainstereo.patch import Patch, resampled, sample_pixels
 from rainstereo.thin_lens import ThinLens
 from rainstereo.types import Array, Image, Mask
 
+from .free_memory import give_back
 from .retraced import Traced, retraced
 
 Window = tuple[slice, slice]
@@ -66,6 +67,7 @@ class BlurredLayer:
 
         made = defocused(drops, camera, chamber, lens, depth, border=border, tracer=trace)
         kept = traced[0] if traced else None
+        give_back()
         if shift == (0, 0) and size == camera.size:
             return cls(drops, made, made, shift, kept)
         x, y = shift
@@ -74,6 +76,12 @@ class BlurredLayer:
         source = made.patch.source + np.array(shift, dtype=np.float32)
         moved = replace(made.patch, rows=rows, columns=columns, source=source, kept=None)
         return cls(drops, made, replace(made, patch=moved, size=size), shift, kept)
+
+    def let_go(self) -> None:
+        """Give up what was made for frames; if there is another, it is made anew."""
+        for each in (self.patch, self.lookup):
+            each.let_go()
+        give_back()
 
     def paste(self, scene: Image, out: Image) -> None:
         """Put the layer over a frame. scene: the clear image, as given."""

@@ -28,6 +28,13 @@ MOST = 32  # rays along a pixel's side
 STEEPER = 1.5  # than rays through the middles of pixels are those that a grid is made for
 
 
+def are_far_caps(drops: Sequence[Drop]) -> bool:
+    """Whether drops are caps on one panel's far face."""
+    places = {(drop.panel, drop.face) if isinstance(drop, SphericalCap) else None for drop in drops}
+    place = places.pop() if len(places) == 1 else None
+    return place is not None and place[1] == "far"
+
+
 @dataclass(frozen=True, eq=False)
 class FarCaps:
     """Caps on one far face, ready for the loop.
@@ -48,9 +55,7 @@ class FarCaps:
     @classmethod
     def of(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber, depth: float) -> FarCaps | None:
         """None if the loop does not suit: there is none, or there are other drops."""
-        places = {(drop.panel, drop.face) if isinstance(drop, SphericalCap) else None for drop in drops}
-        place = places.pop() if len(places) == 1 else None
-        if place is None or place[1] != "far" or not compiled.available():
+        if not (compiled.available() and are_far_caps(drops)):
             return None
         stack = DropStack(chamber, drops)
         stack.check_depth(depth)

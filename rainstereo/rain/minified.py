@@ -26,7 +26,7 @@ from rainstereo.patch import LONGEST, Patch
 from rainstereo.trace import BLOCK, clear_transmittance, trace
 from rainstereo.types import Array, Image, Indices, Mask, Status
 
-from .far_caps import MOST, FarCaps
+from .far_caps import MOST, FarCaps, are_far_caps
 from .free_memory import give_back
 from .lookups import JOINED, Lookups
 from .ordered_threads import in_order
@@ -212,6 +212,7 @@ class Minifier:
         if caps is not None:
             return caps.look(number, None if batch.which is None else batch.which[rows], side, self.clear[number])
         own: Image = np.stack([number % width, number // width], -1).astype(np.float32)
+        exact = are_far_caps(batch.drops)  # as the loop has it, so that frames are the same without it
         along = ((np.arange(side) + 0.5) / side - 0.5).astype(np.float32)
         offsets = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)
         source: Image = np.empty((side * side, len(number), 2), dtype=np.float32)
@@ -225,6 +226,8 @@ class Minifier:
                 pixels = np.concatenate([pixels, np.full_like(pixels[:, :1], np.nan)], 1)  # nobody's, see `_labelled`
             else:
                 drops, labels, pixels = _labelled(batch.drops, batch.which[rows][part], pixels)
+            if exact:
+                pixels = pixels.astype(np.float64)
             traced = trace(pixels, drops, self.camera, self.chamber, self.depth, which=labels)
             # a patch of another shape, for what it makes of a trace
             clear = np.resize(self.clear[number[part]], pixels.shape[1])

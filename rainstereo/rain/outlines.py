@@ -26,6 +26,8 @@ ASIDE = 1.5  # times as far as a drop's top appears from its foot; an image may 
 MARGIN = 2.5
 """Pixels around a drop that are its own too: a ring without any of it, so that two groups share no pixel."""
 
+FEW = 256  # the same where they may be large
+
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
@@ -148,13 +150,14 @@ class Outlines:
     def covered(self) -> Mask:
         """Pixels of the image, (H, W), in any circle."""
         width, height = self.size
-        edges: Any = np.zeros(height * (width + 1), dtype=np.int32)
-        for first in range(0, len(self.x), BLOCK):
-            _, row, start, stop = self.take(np.arange(len(self.x))[first : first + BLOCK])._lines()
+        number = np.dtype(np.int16 if len(self.x) < 1 << 15 else np.int32)  # enough for as many circles at one place
+        edges: Any = np.zeros(height * (width + 1), dtype=number)
+        for first in range(0, len(self.x), FEW):
+            _, row, start, stop = self.take(np.arange(len(self.x))[first : first + FEW])._lines()
             for sign, at in ((1, start), (-1, stop)):
-                np.add.at(edges, row * (width + 1) + at, np.int32(sign))
+                np.add.at(edges, row * (width + 1) + at, number.type(sign))
         edges = edges.reshape(height, width + 1)
-        inside: Mask = np.cumsum(edges, axis=1, dtype=np.int32, out=edges)[:, :width] > 0
+        inside: Mask = np.cumsum(edges, axis=1, dtype=number, out=edges)[:, :width] > 0
         return inside
 
     def _lines(self) -> tuple[Indices, Indices, Indices, Indices]:

@@ -183,9 +183,11 @@ class Quadtree:
         wide, high = (np.array([size[i] for size in of_level], dtype=np.int64) for i in (0, 1))
         uneven = unevenness(len(of_level)).astype(np.float32)
         prices = np.float32(self.worth), np.float32(DEAR * self.worth)
-        rays = (np.ascontiguousarray(each) for each in (x, y, weights, *steps))  # one kind of array: compiled once
+        # one kind of array, so that it is compiled once
+        a, b, share, *four = (np.ascontiguousarray(each) for each in (x, y, weights, *steps))
         merge(
-            *rays, *window, _order(side), _all_places(side), MERGES, side, uneven, *prices, FEW,
+            a, b, share, four[0], four[1], four[2], four[3], *window, _order(side), _all_places(side), MERGES, side,
+            uneven, prices[0], prices[1], FEW,
             np.array(starts(self.size), dtype=np.int64), wide, high, texel, weight, counts, error,
         )  # fmt: skip
         made = int(counts.sum())

@@ -22,7 +22,7 @@ from rainstereo.types import Array, Indices, Mask
 
 from .outlines import Outlines
 
-RAYS = 1 << 18  # at a time
+RAYS = 1 << 16  # at a time
 Window = tuple[slice, slice]
 
 
