@@ -14,69 +14,80 @@ U = np.uint64
 
 @fused
 def exchange(
-    pairs: Any, begin: Any, shapes: Any, side: Any, atoms: Any, along: Any, variance: Any, price: Any, least: Any,
-    columns: Any, there: Any, rects: Any, rounds: int, gain: float, taken: Any, count: Any, inverse: Any, weight: Any,
-    rows: Any, room: Any, base: Any,
+    pairs: Any, begin: Any, shapes: Any, side: Any, atoms: Any, along: Any, variance: Any, price: Any, columns: Any,
+    cost: Any, low: Any, there: Any, rects: Any, rounds: int, gain: float, taken: Any, count: Any, inverse: Any,
+    weight: Any, rows: Any, room: Any, base: Any,
 ) -> Any:  # fmt: skip
     """Change the texels taken, the first `count` of `taken`, and return how many there are then.
 
-    pairs, begin, shapes, side, atoms: see `in_common`. along, variance, price, least: (A,) float32 of texels. columns:
-    (A,) uint32, of which the first `there` are offered, those of `rects`. rounds, gain: see `rain.exchange`. inverse:
-    (MOST, MOST), weight: (MOST,), rows: (2, MOST, A), room: (4, A) float64, base: (A + WIDE,) float32, to work in.
+    pairs, begin, shapes, side, atoms: see `in_common`. along, variance, price: (A,) float32 of texels. columns, cost,
+    low: (A,) uint32, float32, of which the first `there` are of those offered, which are those of `rects`: numbers,
+    what they must be worth, and what must be news. rounds, gain: see `rain.exchange`. inverse: (MOST, MOST), weight:
+    (MOST,), rows: (2, MOST, A), room: (4, A) float64, base: (A + WIDE,) float32, to work in.
     """
     own, seen = rows[U(0)], rows[U(1)]  # what texels taken have in common with those offered; the same, of their news
     rest, news, most, which = room[U(0)], room[U(1)], room[U(2)], room[U(3)]
+    known = U(0)  # rows of `own` that are written
     for _ in range(rounds):
         for i in range(count):
-            for j in range(count):
-                inverse[i, j] = np.float64(common_of(pairs, begin, shapes, side, atoms[taken[i]], atoms[taken[j]]))
+            for j in range(i + U(1)):
+                one = np.float64(common_of(pairs, begin, shapes, side, atoms[taken[i]], atoms[taken[j]]))
+                inverse[i, j], inverse[j, i] = one, one
         invert(along, taken, count, inverse, weight)
-        worst, low = count, 1.0
+        worst, least = count, 1.0
         if count > U(1):
             for i in range(count):
                 worth = weight[i] * weight[i] / inverse[i, i] / price[taken[i]]
-                if worth < low:
-                    worst, low = i, worth
+                if worth < least:
+                    worst, least = i, worth
         if worst < count:
-            for i in range(worst, count - U(1)):
-                taken[i] = taken[i + U(1)]
             count -= U(1)
+            taken[worst] = taken[count]
+            if known > count:
+                own[worst, :there] = own[count, :there]
+                known = count
+            known = min(known, worst) if worst >= known else known
             continue
+        while known < count:
+            widen(pairs, begin, shapes, side, atoms[taken[known]], rects, base, there, own[known])
+            known += U(1)
         for i in range(there):
             column = U(columns[i])
             rest[i], news[i] = np.float64(along[column]), np.float64(variance[column])
         for k in range(count):
-            rows_of(pairs, begin, shapes, side, atoms[taken[k]], rects, base)
-            line = own[k]
-            for i in range(there):
-                line[i] = np.float64(base[i])
-        for k in range(count):
             combine(inverse[k], own, count, there, seen[k])
             lower(rest, news, own[k], seen[k], weight[k], there)
-        for i in range(there):  # one more
-            column = U(columns[i])
-            fresh = news[i] if news[i] > least[column] else np.inf
-            most[i] = rest[i] * rest[i] / fresh - price[column]
-            which[i] = -1.0
-        if count == U(len(weight)):
-            most[:there] = 0.0
+        try_one_more(rest, news, cost, low, there, count < U(len(weight)), most, which)
         for k in range(count):
-            part, back = 1 / inverse[k, k], weight[k]
             lost = weight[k] * weight[k] / inverse[k, k] - price[taken[k]]
-            try_without(rest, news, seen[k], part, back, lost, price, least, columns, np.float64(k), there, most, which)
+            try_without(
+                rest, news, seen[k], 1 / inverse[k, k], weight[k], lost, cost, low, np.float64(k), there, most, which
+            )
         best, highest = U(0), 0.0
         for i in range(there):
-            if most[i] > highest:
-                best, highest = i, most[i]
-        column = U(columns[best])
-        if not highest > gain * price[column]:
+            highest = max(highest, most[i])
+        while best < there and most[best] != highest:
+            best += U(1)
+        if best == there or not highest > gain * cost[best]:
             break
         if which[best] < 0.0:
-            taken[count] = column
+            taken[count] = U(columns[best])
             count += U(1)
         else:
-            taken[U(which[best])] = column
+            k = U(which[best])
+            taken[k] = U(columns[best])
+            widen(pairs, begin, shapes, side, atoms[taken[k]], rects, base, there, own[k])
     return count
+
+
+@fused_part
+def widen(
+    pairs: Any, begin: Any, shapes: Any, side: Any, texel: Any, rects: Any, base: Any, there: Any, line: Any
+) -> None:  # fmt: skip
+    """Write what a texel has in common with those offered, in double precision."""
+    rows_of(pairs, begin, shapes, side, texel, rects, base)
+    for i in range(there):
+        line[i] = np.float64(base[i])
 
 
 @fused_part
@@ -99,17 +110,28 @@ def lower(rest: Any, news: Any, own: Any, seen: Any, weight: Any, there: Any) ->
 
 
 @fused_part
+def try_one_more(
+    rest: Any, news: Any, cost: Any, low: Any, there: Any, room: bool, most: Any, which: Any
+) -> None:  # fmt: skip
+    """Note what each texel is worth beside those that are taken, if there is room for one more."""
+    for i in range(there):
+        fresh = news[i] if news[i] > low[i] else np.inf
+        worth = rest[i] * rest[i] / fresh - cost[i]
+        most[i] = worth if room else 0.0
+        which[i] = -1.0
+
+
+@fused_part
 def try_without(
-    rest: Any, news: Any, seen: Any, part: Any, back: Any, lost: Any, price: Any, least: Any, columns: Any, number: Any,
-    there: Any, most: Any, which: Any,
+    rest: Any, news: Any, seen: Any, part: Any, back: Any, lost: Any, cost: Any, low: Any, number: Any, there: Any,
+    most: Any, which: Any,
 ) -> None:  # fmt: skip
     """Note what each texel is worth in the place of one that is taken, where that is the most so far."""
     for i in range(there):
-        column = U(columns[i])
         away = seen[i] * part
         left, fresh = rest[i] + back * away, news[i] + seen[i] * away
-        fresh = fresh if fresh > least[column] else np.inf
-        worth = left * left / fresh - price[column] - lost
+        fresh = fresh if fresh > low[i] else np.inf
+        worth = left * left / fresh - cost[i] - lost
         better = worth > most[i]
         most[i] = worth if better else most[i]
         which[i] = number if better else which[i]

@@ -85,7 +85,7 @@ def choose(
             shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low, rects
         )
         count = exchange(
-            pairs, begin, shapes, side, atoms, along, variance, price, least, columns, there, rects, rounds, gain,
+            pairs, begin, shapes, side, atoms, along, variance, price, columns, cost, low, there, rects, rounds, gain,
             taken, count, inverse, inner, lines, spare, base,
         )  # fmt: skip
         for number in range(count):

@@ -44,7 +44,8 @@ def _of_pixel(
         weight = inverse @ along[taken].astype(np.float64)
         lost = weight**2 / np.diag(inverse)
         if len(taken) > 1 and (lost / price[taken]).min() < 1:
-            del taken[int((lost / price[taken]).argmin())]
+            taken[int((lost / price[taken]).argmin())] = taken[-1]
+            taken.pop()
             continue
         own = gram[np.ix_(taken, columns)].astype(np.float64)
         seen = inverse @ own
