@@ -45,7 +45,7 @@ from .cap_rays import (
     cross,
 )
 from .cap_shares import contact_share, from_rival
-from .cap_tiles import ABX, ABY, AX, AXX, AY, AYY, BX, BXX, BY, BYY, CX, CY, LITS, PART, WHOLE
+from .cap_tiles import LITS
 from .cap_vectors import above_zero, lanes_from, lowest, sum_of_16, weighed
 from .compile import fused, fused_part
 from .prefetch import to_read
@@ -70,41 +70,13 @@ def slopes_of_row(tile: Any, t: Any, slopes: Any) -> None:
             slopes[3 * plane + power] = tile[plane, 1, power] + (t + t) * tile[plane, 2, power]
 
 
-@fused
-def cut_patches(s: Any, low: Any, high: Any, line: Any, slopes: Any, rays: Any) -> None:
-    """Leave of the patches of a row, lanes low to before high, what the cap shows where it hides a part of a pixel.
-
-    The part is taken for one side of the pixel, of which the contact line cuts off the other. s, line, slopes: see
-    `set_out`.
-    """
-    for lane in range(low, high):
-        j, share = np.uint64(lane), rays[HIDDEN + np.uint64(lane)]
-        if not (ZERO < share < ONE and rays[LITS + j] == WHOLE) or rays[RIVAL + j] > ZERO:
-            continue
-        at = s + np.float32(np.int32(lane))
-        px, py = _at(line, 0, at), _at(line, 1, at)
-        along = px * _along(line, 0, at) + py * _along(line, 1, at)  # how the distance from the axis grows
-        down = px * _at(slopes, 0, at) + py * _at(slopes, 1, at)
-        middle = HALF * (ONE - share)
-        rays[PART + j] *= share
-        if abs(along) > abs(down):
-            middle = -middle if along > ZERO else middle
-            _cut(CX, AX, AXX, BX, ABX, middle, share, rays, j)
-            _cut(CY, AY, AYY, BY, ABY, middle, share, rays, j)
-        else:
-            middle = -middle if down > ZERO else middle
-            _cut(CX, BX, BXX, AX, ABX, middle, share, rays, j)
-            _cut(CY, BY, BYY, AY, ABY, middle, share, rays, j)
-
-
 @fused_part
-def _cut(own: Any, once: Any, twice: Any, other: Any, both: Any, middle: Any, share: Any, rays: Any, j: Any) -> None:
-    """A quadratic of a place on a pixel, as that of a place on a part of it: about its middle, a share as wide."""
-    rays[own + j] += middle * (rays[once + j] + HALF * middle * rays[twice + j])
-    rays[once + j] = share * (rays[once + j] + middle * rays[twice + j])
-    rays[twice + j] *= share * share
-    rays[other + j] += middle * rays[both + j]
-    rays[both + j] *= share
+def share_out(rays: Any, low: Any, high: Any) -> None:
+    """Give rays of their own to those pixels of a row, lanes low to before high, that are lit and cut by a contact line."""
+    for j in range(np.uint64(low), np.uint64(max(low, high))):
+        share = rays[HIDDEN + j]
+        cut = ONE if share < ONE else rays[LITS + j]
+        rays[LITS + j] = cut if share > ZERO and rays[LITS + j] > ZERO else rays[LITS + j]
 
 
 @fused_part

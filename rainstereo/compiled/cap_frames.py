@@ -11,11 +11,11 @@ from .cap_edges import (
     HOLDS,
     RAYS,
     boxes_of_rays,
-    cut_patches,
     edges_of_words,
     form_of,
     has_own,
     set_out,
+    share_out,
     slopes_of_row,
     trace_own,
 )
@@ -115,8 +115,7 @@ def frame(
                         taken(tile, t, s, u1, v, lanes, wide, caps, number, rivals, outlines, line, rays)
                     of_row(tile, t, line)
                     slopes_of_row(tile, t, slopes)
-                    if not hangs:
-                        cut_patches(s, max(low, begin), min(high, end), line, slopes, rays)
+                    share_out(rays, begin, end)
                     if mode != DRAW:
                         record_row(
                             mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, edge, caps,

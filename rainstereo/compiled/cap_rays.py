@@ -18,9 +18,8 @@ import numpy as np
 from .compile import fused_part
 
 PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
-OWN, SIDES, ABOVE, BELOW = (np.uint64(64 * i) for i in (11, 14, 17, 20))
-"""Rays of a row of pixels: through their middles, the middles of their left sides, and their upper and lower left
-corners; places, and gain."""
+OWN, ABOVE, BELOW = (np.uint64(64 * i) for i in (11, 14, 17))
+"""Rays of a row of pixels: through their middles, and their upper and lower left corners; places, and gain."""
 SUB = np.uint64(64 * 23)  # of one pixel
 PATCH = np.uint64(64 * 26)
 HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))

@@ -65,20 +65,22 @@ def _folded(builder: Any, values: Any, add: Any, lanes: int) -> Any:
 
 
 @intrinsic
-def _above_zero(_context: Any, rays: Any, plane: Any) -> Any:
-    """above_zero(rays, plane): which of a plane's 64 lanes are, as bits."""
+def _above(_context: Any, rays: Any, plane: Any, _limit: Any) -> Any:
+    """above(rays, plane, limit): which of a plane's 64 lanes are, as bits."""
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        data, first = _data(context, builder, signature, given)
+        data, first, limit = _data(context, builder, signature, given)
+        nothing = ir.Constant(REALS, ir.Undefined)
+        limits = builder.shuffle_vector(builder.insert_element(nothing, limit, FOUR(0)), nothing, _all(0))
         bits = LONG(0)
         for lane in range(0, ALL_LANES, WIDE):
             values = _load(builder, data, builder.add(first, LONG(lane)), REALS)
-            above = builder.fcmp_ordered(">", values, ir.Constant(REALS, [0.0] * WIDE))
+            above = builder.fcmp_ordered(">", values, limits)
             part = builder.zext(builder.bitcast(above, ir.IntType(WIDE)), LONG)
             bits = builder.or_(bits, builder.shl(part, LONG(lane)))
         return bits
 
-    return types.uint64(rays, types.uint64), code
+    return types.uint64(rays, types.uint64, types.float32), code
 
 
 @intrinsic
@@ -87,6 +89,16 @@ def _lowest(_context: Any, _bits: Any) -> Any:
 
     def code(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
         return builder.cttz(given[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.uint64(types.uint64), code
+
+
+@intrinsic
+def _highest(_context: Any, _bits: Any) -> Any:
+    """highest(bits): the number of the highest bit of some that are not 0."""
+
+    def code(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+        return builder.sub(LONG(63), builder.ctlz(given[0], ir.Constant(ir.IntType(1), 1)))
 
     return types.uint64(types.uint64), code
 
@@ -183,12 +195,25 @@ def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any) 
     return types.uint64(words, at, types.uint64, types.uint64), code
 
 
-above_zero: Any = _above_zero
+above: Any = _above
 lowest: Any = _lowest
+highest: Any = _highest
 thrice: Any = _thrice
 sum_of_16: Any = _sum_of_16
 weighed: Any = _weighed
 sum_of_words: Any = _sum_of_words
+
+
+@fused_part
+def above_zero(rays: Any, plane: Any) -> Any:
+    """Which of a plane's 64 lanes are above 0, as bits."""
+    return above(rays, plane, np.float32(0))
+
+
+@fused_part
+def ends(marked: Any) -> Any:
+    """Of the lanes that are marked, the first and that after the last; 0, 0 if there is none."""
+    return (np.int64(lowest(marked)), np.int64(highest(marked)) + 1) if marked else (0, 0)
 
 
 @fused_part
