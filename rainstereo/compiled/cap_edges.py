@@ -72,7 +72,8 @@ def slopes_of_row(tile: Any, t: Any, slopes: Any) -> None:
 
 @fused_part
 def share_out(rays: Any, low: Any, high: Any) -> None:
-    """Give rays of their own to those pixels of a row, lanes low to before high, that are lit and cut by a contact line."""
+    """Give rays of their own to those pixels of a row, lanes low to before high, that are lit and that a contact line
+    cuts."""
     for j in range(np.uint64(low), np.uint64(max(low, high))):
         share = rays[HIDDEN + j]
         cut = ONE if share < ONE else rays[LITS + j]

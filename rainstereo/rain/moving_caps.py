@@ -152,14 +152,15 @@ class CapScene:
 
     def go(self, mode: int, out: Any, scene: Any, words: Any, caps: CapTable, record: Any) -> None:
         """Run the loops over caps, see `compiled.cap_frames.frame`."""
-        from rainstereo.compiled.cap_frames import frame
+        from rainstereo.compiled.cap_frames import desk, frame
 
         lattice, boxes = self.lattice, self.boxes
         border = 0 if self.border == "mirror" else 1
         shift = np.float32(self.shift[0]), np.float32(self.shift[1])
+        flat, sizes = out.reshape(-1), (boxes.start, boxes.width, boxes.inverse)
         frame(
-            mode, out, scene, words, (boxes.start, boxes.width, boxes.inverse), border, shift, self.looks,
-            caps.nodes, caps.columns, caps.outlines, caps.rivals, lattice.later, lattice.view, record,
+            mode, flat, self.camera.size, scene, words, sizes, border, shift, self.looks, caps.nodes, caps.columns,
+            caps.outlines, caps.rivals, lattice.later, lattice.view, record, desk(),
         )  # fmt: skip
 
 
