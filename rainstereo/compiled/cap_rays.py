@@ -20,8 +20,8 @@ from .compile import fused_part
 PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
 OWN, ABOVE, BELOW = (np.uint64(64 * i) for i in (11, 14, 17))
 """Rays of a row of pixels: through their middles, and their upper and lower left corners; places, and gain."""
-SUB = np.uint64(64 * 23)  # of one pixel
-PATCH = np.uint64(64 * 26)
+SUB = np.uint64(64 * 20)  # of one pixel
+PATCH = np.uint64(64 * 23)
 HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))
 """Of a row: the share of each pixel that a cap hides; and 1 + the number of another that shows some of it, or 0."""
 SHOWN, COVER = np.uint64(64 * 45), np.uint64(64 * 48)

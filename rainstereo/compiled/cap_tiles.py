@@ -48,15 +48,17 @@ OUT_X, OUT_Y, OUT_RADIUS, OUT_RIVAL, OUT_RIVALS = range(5)
 """Columns of a table of outlines, float64: a circle in the image, and which of the list of rivals are the cap's."""
 WHOLE, PARTLY = np.float32(2), np.float32(1)
 """Of a pixel's rays beside it, whether all or only some are lit."""
-CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, PART, GRID, FAR, LITS = (
-    PATCH + np.uint64(64 * i) for i in range(17)
+CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, PART, GRID, FAR, LITS, EIGHTS = (
+    PATCH + np.uint64(64 * i) for i in range(18)
 )  # fmt: skip
 """Planes of patches: the middle of what a pixel shows; how places change along x (A) and y (B), twice along each, and
 along both; mean gain; area, square pixels, that one look stands for; the number of the grid of looks; pixels between
-what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0."""
-AREAS, AIMS, FIRSTS, PARTS = range(4)
+what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0; how many eights of looks it has, or `OTHER`."""
+AREAS, AIMS, FIRSTS, PARTS, ROOMS = range(5)
 """Columns of a table of bands: up to which area of a patch, how many looks it gets, from which grid on, and
-which part of the patch's area a box has."""
+which part of the patch's area a box has; eights of looks, or `OTHER`."""
+OTHER = np.float32(6)
+"""In place of how many eights of looks: for looks at four boxes each, and for those that may fall beyond the scene."""
 LARGEST = np.float32(110 * 110)
 """Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
 
@@ -205,13 +207,14 @@ def reach(ax: Any, bx: Any, axx: Any, bxx: Any, mixed: Any) -> Any:
 def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -> None:
     """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel.
 
-    bands: (4, 4), see `AREAS`.
+    bands: (4, 5), see `AREAS`.
     """
     dx, dy, end_x, end_y = shift[0], shift[1], last[0], last[1]
     area1, area2, area3 = bands[0, AREAS], bands[1, AREAS], bands[2, AREAS]
     aim0, aim1, aim2, aim3 = bands[0, AIMS], bands[1, AIMS], bands[2, AIMS], bands[3, AIMS]
     first0, first1, first2, first3 = bands[0, FIRSTS], bands[1, FIRSTS], bands[2, FIRSTS], bands[3, FIRSTS]
     part0, part1, part2, part3 = bands[0, PARTS], bands[1, PARTS], bands[2, PARTS], bands[3, PARTS]
+    room0, room1, room2, room3 = bands[0, ROOMS], bands[1, ROOMS], bands[2, ROOMS], bands[3, ROOMS]
     one, tiny, small, two, twelfth = (
         np.uint64(1),
         np.float32(1e-20),
@@ -247,11 +250,16 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -
         rays[AYY + j] = ayy
         rays[BYY + j] = byy
         rays[ABY + j] = mixed
-        rays[FAR + j] = far if far < p else p
+        far = far if far < p else p
+        rays[FAR + j] = far
         area = abs(ax * by - ay * bx)
         aim, first, part = (aim0, first0, part0) if area < area1 else (aim1, first1, part1)
         aim, first, part = (aim, first, part) if area < area2 else (aim2, first2, part2)
         aim, first, part = (aim, first, part) if area < area3 else (aim3, first3, part3)
+        room = room0 if area < area1 else room1
+        room = room if area < area2 else room2
+        room = room if area < area3 else room3
+        rays[EIGHTS + j] = room if far >= ZERO else OTHER
         rays[PART + j] = area * part
         rays[LITS + j] = rays[LITS + j] if area < LARGEST else PARTLY
         ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))

@@ -159,14 +159,15 @@ def _weighed(_context: Any, words: Any, at: Any, _first: Any, rays: Any, _weight
 
 
 @intrinsic
-def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any) -> Any:
-    """sum_of_words(words, at, first, count): of up to 64 words, as if each had been spread (`boxes.spread`).
+def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any, _room: Any) -> Any:
+    """sum_of_words(words, at, first, count, room): of up to 64 words, as if each had been spread (`boxes.spread`).
 
-    at: their numbers, from `first` on, up to a multiple of 8 of which those after `count` are any words'.
+    at: their numbers, from `first` on, up to a number `room` of them, a multiple of 8; those after `count` are any
+    words'.
     """
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        texels, numbers, first, count = _data(context, builder, signature, given)
+        texels, numbers, first, count, room = _data(context, builder, signature, given)
         outer = FIELD | FIELD << 2 * BITS
         before, loop, after = builder.block, builder.append_basic_block("eight"), builder.append_basic_block("sum")
         limit = builder.insert_element(ir.Constant(WORDS, ir.Undefined), builder.trunc(count, FOUR), FOUR(0))
@@ -180,7 +181,7 @@ def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any) 
         parts = builder.and_(found, _all(outer)), builder.and_(builder.lshr(found, _all(BITS)), _all(FIELD))
         added = [builder.add(old, one) for old, one in zip(sums, parts, strict=True)]
         further, next_lanes = builder.add(done, LONG(WIDE)), builder.add(lanes, _all(WIDE))
-        builder.cbranch(builder.icmp_unsigned("<", further, count), loop, after)
+        builder.cbranch(builder.icmp_unsigned("<", further, room), loop, after)
         starts = LONG(0), ir.Constant(WORDS, list(range(WIDE))), _all(0), _all(0)
         for phi, start, new in zip((done, lanes, *sums), starts, (further, next_lanes, *added), strict=True):
             phi.add_incoming(start, before)
@@ -192,7 +193,7 @@ def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any) 
         low, middle = builder.and_(both, LONG((1 << 16) - 1)), builder.lshr(both, LONG(16))
         return builder.or_(low, builder.or_(builder.shl(last, LONG(20)), builder.shl(middle, LONG(40))))
 
-    return types.uint64(words, at, types.uint64, types.uint64), code
+    return types.uint64(words, at, types.uint64, types.uint64, types.uint64), code
 
 
 above: Any = _above

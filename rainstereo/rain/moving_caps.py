@@ -136,11 +136,14 @@ class CapScene:
     @cached_property
     def looks(self) -> tuple[Any, ...]:
         """Grids of looks and what says which a patch gets, see `compiled.cap_frames.frame`."""
+        from rainstereo.compiled.cap_tiles import OTHER
+
         grids: list[Array] = []
         counts: list[int] = []
-        bands: list[tuple[float, int, int, float]] = []
+        bands: list[tuple[float, int, int, float, int]] = []
         for (side, aim), wider in zip(self.fineness, WIDER, strict=True):
-            bands.append((min(side * side, FAR), aim, len(counts) - 2, wider / aim))
+            eights = -(-aim // 8) if bands else int(OTHER)
+            bands.append((min(side * side, FAR), aim, len(counts) - 2, wider / aim, eights))
             for across in range(2, aim // 2 + 1):
                 down = max(aim // across, 2)
                 s, t = (part.ravel() for part in np.meshgrid(_middles(across), _middles(down)))

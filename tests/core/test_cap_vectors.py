@@ -23,7 +23,9 @@ def test_sums_are_those_of_channels():
 
     @fused_part
     def of_words(words, at, first, count):
-        return channels_of(cap_vectors.sum_of_words(words, at, first, count))
+        return channels_of(
+            cap_vectors.sum_of_words(words, at, first, count, (count + np.uint64(7)) // np.uint64(8) * np.uint64(8))
+        )
 
     @fused_part
     def of_weights(words, at, first, rays, weights):
