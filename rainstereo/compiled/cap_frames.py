@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from .cap_edges import (
-    HOLDS,
     RAYS,
+    TOGETHER,
+    WHITE,
     boxes_of_rays,
-    edges_of_words,
+    draw_own,
     form_of,
     has_own,
+    own_of_row,
     set_out,
     share_out,
     slopes_of_row,
@@ -48,7 +50,6 @@ from .compile import fused, fused_part
 from .layout import DRAW, FILL
 from .prefetch import to_write
 
-WHITE = np.float32(255)
 EIGHT = np.uint64(8)
 
 
@@ -72,12 +73,13 @@ def frame(
     grids, counts, fines, bands = looks
     width, height = size
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
-    rays, line, tile, slopes, total, at, quarters, slots, held = desk
+    rays, line, tile, slopes, total, at, quarters, slots, beams, pixels, hidden = desk
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
             continue
         left, right, top, bottom = bounds(outline, width, height)
+        made = 0
         for v1 in range(top, bottom, TILE):
             v2 = min(v1 + TILE, bottom)
             for u1 in range(left, right, TILE):
@@ -128,11 +130,16 @@ def frame(
                             words, scene, starts, pitches, inverses, last, border, grids, counts, fines, begin, end,
                             rays, total, at, quarters, slots,
                         )  # fmt: skip
-                    edges_of_words(
+                    made = own_of_row(
                         words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
-                        later, view, low, high, line, slopes, rays, at, held,
+                        later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden, total, width, out,
                     )  # fmt: skip
                     write_bytes(out, width, scene.shape[2], v, u1, lanes, rays)
+        if made > 0:
+            draw_own(
+                words, scene, starts, last, shift, border, cap, outline, later, view, beams, at, pixels[:made],
+                hidden[:made], total, out,
+            )  # fmt: skip
 
 
 @fused
@@ -192,8 +199,9 @@ def desk() -> tuple[Any, ...]:
     """Room for what `frame` works on."""
     return (
         np.zeros(PLANES * 64, np.float32), np.zeros(15, np.float32), np.zeros((5, 3, 3), np.float32),
-        np.zeros(12, np.float32), np.zeros(4, np.float32), np.zeros(64 + HOLDS * RAYS, np.uint32),
-        np.zeros(ROUND * 64, np.uint32), np.zeros((3, ROUND), np.int64), np.zeros(HOLDS, np.int64),
+        np.zeros(12, np.float32), np.zeros(4, np.float32), np.zeros(ROUND * 64, np.uint32),
+        np.zeros(ROUND * 64, np.uint32), np.zeros((3, ROUND), np.int64), np.zeros(PLANES * 64, np.float32),
+        np.zeros(TOGETHER, np.int64), np.zeros(TOGETHER, np.float32),
     )  # fmt: skip
 
 

@@ -29,11 +29,10 @@ SHOWN, COVER = np.uint64(64 * 45), np.uint64(64 * 48)
 WEIGHT, STRETCH = np.uint64(64 * 51), np.uint64(64 * 52)
 SPREAD, PER = np.uint64(64 * 53), np.uint64(64 * 54)
 """Of a pixel's own rays: see `cross`, and how a box's size follows from how far a ray looks (`cap_edges`)."""
-HELD = np.uint64(64 * 55)
-"""Weights of rays whose boxes are on their way from memory."""
-MARK = np.uint64(64 * 83)
+MARK = np.uint64(64 * 55)
 """Of a row: above 0 in the lanes that something is to be done about."""
-PLANES = 84
+SHARPNESS = np.uint64(64 * 56)  # 1 / `SPREAD`
+PLANES = 57
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
@@ -120,7 +119,7 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
 
     The gain is 0 where no light comes through. later: (F, 3) float32, thickness before a face and the indices
     on both sides, of the faces behind the cap's.
-    soft: each ray stands for light about it, over which the square of the wave vector's component along the normal
+    soft: the components of wave vectors along the panel's normal, `KZ`, are known; and each ray stands for light about it, over which the square of the wave vector's component along the normal
     behind the cap goes from `SPREAD` below to as much above the ray's. That component is what places and gains depend
     on, nearly linearly, also where it ends, at the critical angle, and they as steeply as a square root: so its mean
     gives the light's gain, and its mean weighted with itself the light's middle. The plane `STRETCH` gets the component
@@ -134,7 +133,7 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
     first, last = np.uint64(low), np.uint64(high)
     for j in range(first, last):
         px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
-        kz = np.float32(math.sqrt(q - kx * kx - ky * ky))
+        kz = rays[KZ + j] if soft else np.float32(math.sqrt(q - kx * kx - ky * ky))
         room = square - px * px - py * py
         b = kz * depth + px * kx + py * ky
         root = np.float32(math.sqrt(b * b + room * q))
@@ -144,12 +143,14 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
         inside = before * before + less
         turned = mean = np.float32(math.sqrt(inside))
         if soft:
-            spread = rays[SPREAD + j]
-            per = ONE / spread
+            spread, per = rays[SPREAD + j], rays[SHARPNESS + j]
             high, low_ = inside + spread, inside - spread
             high, low_ = (high if high > ZERO else ZERO), (low_ if low_ > ZERO else ZERO)
             mean = (high * np.float32(math.sqrt(high)) - low_ * np.float32(math.sqrt(low_))) * (a_third * per)
-            turned = (high + low_) * (high - low_) * (a_fourth * per) / (mean if mean > ZERO else ONE)
+            turned = (high + low_) * (high - low_) * (a_fourth * per)
+            over = ONE / (mean * turned)  # one division for two; NaN where there is no light
+            rays[STRETCH + j] = before * mean * mean * over
+            turned *= turned * over
             inside = high
         p, t = before + q * turned, before + turned
         both = ONE / (p * t)
@@ -159,9 +160,6 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
         px += s * kx
         py += s * ky
         up = kz + bend * (rise + depth)
-        if soft:
-            drawn_out = before / turned
-            rays[STRETCH + j] = drawn_out if turned > ZERO else ZERO
         rays[PX + j] = px
         rays[PY + j] = py
         rays[RISE + j] = rise
