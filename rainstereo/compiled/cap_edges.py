@@ -45,7 +45,7 @@ from .cap_rays import (
     cross,
 )
 from .cap_shares import contact_share, from_rival
-from .cap_tiles import LITS
+from .cap_tiles import LITS, WHOLE
 from .cap_vectors import above_zero, lanes_from, lowest, sum_of_16, weighed
 from .compile import fused, fused_part
 from .prefetch import to_read
@@ -77,9 +77,8 @@ def share_out(rays: Any, low: Any, high: Any) -> None:
     """Give rays of their own to those pixels of a row, lanes low to before high, that are lit and that a contact line
     cuts."""
     for j in range(np.uint64(low), np.uint64(max(low, high))):
-        share = rays[HIDDEN + j]
-        cut = ONE if share < ONE else rays[LITS + j]
-        rays[LITS + j] = cut if share > ZERO and rays[LITS + j] > ZERO else rays[LITS + j]
+        most = ONE if ZERO < rays[HIDDEN + j] < ONE else WHOLE
+        rays[LITS + j] = rays[LITS + j] if rays[LITS + j] < most else most
 
 
 @fused_part

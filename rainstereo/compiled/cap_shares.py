@@ -226,8 +226,9 @@ def taken(
             by_side = room + b * b if b < ZERO else room
             more = room - (rays[ROOM + j] + need)
             more = more if by_side > -edge else -FAR_LESS
-            rays[HIDDEN + j] = ZERO if more > ZERO else rays[HIDDEN + j]
-            rays[RIVAL + j] = name if more > -part else rays[RIVAL + j]
+            rays[HIDDEN + j] *= ZERO if more > ZERO else ONE
+            near = ONE if more > -part else ZERO
+            rays[RIVAL + j] += near * (name - rays[RIVAL + j])
 
 
 @compiled
