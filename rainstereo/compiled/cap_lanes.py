@@ -13,8 +13,9 @@ from typing import Any
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from .cap_vectors import LONG, REALS, WIDE, ir
+from .cap_vectors import LONG, REALS, WIDE, folded, ir
 
+SIDE = 4  # samples along a pixel's side where a cap hangs over
 Number = Any  # Lanes, or a float that is the same in all of them
 FUSED = ("contract",)
 KX, KY, KZ, DIM, RISE = (64 * i for i in (2, 3, 4, 5, 6))
@@ -205,6 +206,40 @@ def _project(
     return _loop(_arguments(rays, 16), _to_scene)
 
 
+@intrinsic
+def _side_sum(
+    _context: Any, _px: Any, _py: Any, _kx: Any, _ky: Any, _kz: Any, _radius: Any, _depth: Any, _xu: Any, _xv: Any,
+    _yu: Any, _yv: Any, _per: Any,
+) -> Any:  # fmt: skip
+    def code(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+        px, py, kx, ky, kz, radius, depth, xu, xv, yu, yv, per = (Lanes.of(builder, number) for number in given)
+        shares = []
+        for half in range(2):
+            s, t = ([(number + 0.5) / SIDE - 0.5 for number in some] for some in _places_of(half))
+            s, t = (Lanes(builder, ir.Constant(REALS, some)) for some in (s, t))
+            x, y = px + s * xu + t * xv, py + s * yu + t * yv
+            square = x * x + y * y
+            b = x * kx + y * ky + kz * depth
+            away = radius - square.root()
+            gx, gy = b * kx - x, b * ky - y
+            to_side = (b * b + radius * radius - square) * 0.5 / (gx * gx + gy * gy).root()
+            before = builder.and_((b * -1.0).above(0.0), (to_side - away).above(0.0))
+            share = to_side.where(before, away) * per + 0.5
+            share = share.where(share.above(0.0))
+            shares.append(share.where((1.0 - share).above(0.0), 1.0))
+        return folded(builder, (shares[0] + shares[1]).value, builder.fadd, WIDE)
+
+    return types.float32(*[types.float32] * 12), code
+
+
+def _places_of(half: int) -> tuple[list[int], list[int]]:
+    """Columns and rows of eight of a pixel's samples."""
+    return [lane % SIDE for lane in range(WIDE)], [(WIDE * half + lane) // SIDE for lane in range(WIDE)]
+
+
+side_sum: Any = _side_sum
+"""side_sum(px, py, kx, ky, kz, radius, depth, xu, xv, yu, yv, per): of the shares that a pixel's samples stand for
+which a cap hides (`cap_shares.side_share`); per: samples along a side over metres a pixel."""
 through_hard: Any = _through_hard
 """through_hard(rays, first, last, to, square, depth, curvature, q): `cross` (`cap_rays`) up to behind the cap."""
 through_soft: Any = _through_soft

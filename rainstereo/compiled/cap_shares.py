@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .cap_lanes import SIDE, side_sum
 from .cap_rays import (
     CAP_CURVATURE,
     CAP_DEPTH,
@@ -36,7 +37,6 @@ from .cap_tiles import OUT_RADIUS, OUT_RIVAL, OUT_RIVALS, OUT_X, OUT_Y, along, d
 from .cap_vectors import above, above_zero, ends, lanes_from, lowest
 from .compile import compiled, fused, fused_part
 
-SIDE = 4  # samples along a pixel's side where a cap hangs over
 SAGITTA = np.float32(1.1 / 24)
 """How far an arc is from its tangent in the mean, over the square of its length and its curvature: 1/24; arcs across a
 pixel are somewhat longer than its side."""
@@ -85,21 +85,8 @@ def side_share(px: Any, py: Any, kx: Any, ky: Any, radius: Any, depth: Any, xu: 
         return ZERO
     if away > across and b < -across:
         return ONE
-    total = ZERO
-    for i in range(SIDE):
-        t = (np.float32(i) + HALF) / np.float32(SIDE) - HALF
-        for j in range(SIDE):
-            s = (np.float32(j) + HALF) / np.float32(SIDE) - HALF
-            x, y = px + s * xu + t * xv, py + s * yu + t * yv
-            r2 = x * x + y * y
-            away = radius - np.float32(math.sqrt(r2))
-            b = x * kx + y * ky + kz * depth
-            if b < ZERO:
-                gx, gy = b * kx - x, b * ky - y
-                meets = b * b + radius * radius - r2
-                away = max(away, HALF * meets / max(np.float32(math.sqrt(gx * gx + gy * gy)), np.float32(1e-12)))
-            total += min(max(HALF + away / across * np.float32(SIDE), ZERO), ONE)
-    return total / np.float32(SIDE * SIDE)
+    per = np.float32(SIDE) / across
+    return side_sum(px, py, kx, ky, kz, radius, depth, xu, xv, yu, yv, per) / np.float32(SIDE * SIDE)
 
 
 @fused_part

@@ -49,7 +49,7 @@ def _gathered(builder: Any, words: Any, numbers: Any, first: Any) -> Any:
     return found
 
 
-def _folded(builder: Any, values: Any, add: Any, lanes: int) -> Any:
+def folded(builder: Any, values: Any, add: Any, lanes: int) -> Any:
     """The sum over a vector's lanes."""
     while lanes > 1:
         lanes //= 2
@@ -129,7 +129,7 @@ def _sum_of_16(_context: Any, rays: Any, _first: Any) -> Any:
         values = builder.fadd(
             _load(builder, data, first, REALS), _load(builder, data, builder.add(first, LONG(WIDE)), REALS)
         )
-        return _folded(builder, values, builder.fadd, WIDE)
+        return folded(builder, values, builder.fadd, WIDE)
 
     return types.float32(rays, types.uint64), code
 
@@ -151,7 +151,7 @@ def _weighed(_context: Any, words: Any, at: Any, _first: Any, rays: Any, _weight
             new = [builder.fmul(builder.sitofp(part, REALS), weight) for part in parts] + [weight]
             sums = [builder.fadd(old, one) for old, one in zip(sums, new, strict=True)] if sums else new
         return context.make_tuple(
-            builder, signature.return_type, [_folded(builder, part, builder.fadd, WIDE) for part in sums]
+            builder, signature.return_type, [folded(builder, part, builder.fadd, WIDE) for part in sums]
         )
 
     four: Any = vars(types)["UniTuple"](types.float32, 4)
@@ -188,8 +188,8 @@ def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any, 
             phi.add_incoming(new, loop)
         builder.position_at_end(after)  # the last channel may have 12 bits: its sum is not folded beside the first's
         first_middle = builder.or_(builder.and_(added[0], _all((1 << 16) - 1)), builder.shl(added[1], _all(16)))
-        last = builder.zext(_folded(builder, builder.lshr(added[0], _all(2 * BITS)), builder.add, WIDE), LONG)
-        both = builder.zext(_folded(builder, first_middle, builder.add, WIDE), LONG)
+        last = builder.zext(folded(builder, builder.lshr(added[0], _all(2 * BITS)), builder.add, WIDE), LONG)
+        both = builder.zext(folded(builder, first_middle, builder.add, WIDE), LONG)
         low, middle = builder.and_(both, LONG((1 << 16) - 1)), builder.lshr(both, LONG(16))
         return builder.or_(low, builder.or_(builder.shl(last, LONG(20)), builder.shl(middle, LONG(40))))
 
