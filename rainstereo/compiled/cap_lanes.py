@@ -139,7 +139,8 @@ def _through_cap(soft: bool) -> Callable[..., None]:
             high, low = high.where(high.above(0.0)), low.where(low.above(0.0))
             mean = (high * high.root() - low * low.root()) * (per * (1 / 3))
             turned = (high + low) * (high - low) * (per * 0.25)
-            over = 1.0 / (mean * turned)  # one division for two; NaN where there is no light
+            product = mean * turned
+            over = 1.0 / product.where(product.above(0.0), 1.0)  # one division for two
             put(stretch_, before * mean * mean * over)
             turned = turned * (turned * over)
             inside = high
