@@ -16,6 +16,7 @@ from numba.extending import intrinsic
 from .cap_vectors import LONG, REALS, WIDE, folded, ir
 
 SIDE = 4  # samples along a pixel's side where a cap hangs over
+declared: Any = vars(cgutils)["get_or_insert_function"]
 Number = Any  # Lanes, or a float that is the same in all of them
 FUSED = ("contract",)
 KX, KY, KZ, DIM, RISE = (64 * i for i in (2, 3, 4, 5, 6))
@@ -75,7 +76,7 @@ class Lanes:
     def root(self) -> Lanes:
         """The square root; NaN of what is negative."""
         kind = ir.FunctionType(REALS, [REALS])
-        call = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.sqrt.v{WIDE}f32")
+        call = declared(self.builder.module, kind, f"llvm.sqrt.v{WIDE}f32")
         return Lanes(self.builder, self.builder.call(call, [self.value]))
 
     def above(self, other: Number) -> Any:
@@ -216,8 +217,8 @@ def _side_sum(
         px, py, kx, ky, kz, radius, depth, xu, xv, yu, yv, per = (Lanes.of(builder, number) for number in given)
         shares = []
         for half in range(2):
-            s, t = ([(number + 0.5) / SIDE - 0.5 for number in some] for some in _places_of(half))
-            s, t = (Lanes(builder, ir.Constant(REALS, some)) for some in (s, t))
+            places = ([(number + 0.5) / SIDE - 0.5 for number in some] for some in _places_of(half))
+            s, t = (Lanes(builder, ir.Constant(REALS, some)) for some in places)
             x, y = px + s * xu + t * xv, py + s * yu + t * yv
             square = x * x + y * y
             b = x * kx + y * ky + kz * depth

@@ -33,7 +33,7 @@ from .outlines import Outlines
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE = (20.0, 8), (24.0, 12), (64.0, 24), (math.inf, 36)
+FINE = (20.0, 8), (24.0, 12), (64.0, 24), (math.inf, 40)
 COARSE = (16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)
 """Square root of the area, pixels, up to which what a pixel shows gets how many looks, the first of them at four boxes
 each."""
