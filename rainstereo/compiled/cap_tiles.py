@@ -61,6 +61,8 @@ OTHER = np.float32(6)
 """In place of how many eights of looks: for looks at four boxes each, and for those that may fall beyond the scene."""
 LARGEST = np.float32(110 * 110)
 """Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
+LARGEST_ALONE = np.float32(64 * 64)
+"""The same where a neighbour's middle is dark, so that it is less sure how the patch is bent."""
 
 
 @fused_part
@@ -261,7 +263,7 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -
         room = room if area < area3 else room3
         rays[EIGHTS + j] = room if far >= ZERO else OTHER
         rays[PART + j] = area * part
-        rays[LITS + j] = rays[LITS + j] if area < LARGEST else PARTLY
+        rays[LITS + j] = rays[LITS + j] if area < (LARGEST if known else LARGEST_ALONE) else PARTLY
         ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))
         across = np.float32(math.sqrt(aim * np.float32(math.sqrt(ratio)))) + HALF
         across = across if across < HALF * aim else HALF * aim
