@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .cap_looks import BIAS, ONE_, SMALLEST, TWO_, folded, pixel_value
+from .cap_looks import BIAS, ONE_, SMALLEST, folded, pixel_value
 from .cap_rays import (
     CAP_CURVATURE,
     CAP_DEPTH,
@@ -23,10 +23,10 @@ from .cap_rays import (
     DIM,
     GAIN,
     HALF,
-    HELD,
     HIDDEN,
     KX,
     KY,
+    KZ,
     MARK,
     ONE,
     PER,
@@ -35,7 +35,7 @@ from .cap_rays import (
     RIVAL,
     ROOM,
     SHARE,
-    SHOWN,
+    SHARPNESS,
     SPREAD,
     STRETCH,
     SUB,
@@ -45,19 +45,21 @@ from .cap_rays import (
     cross,
 )
 from .cap_shares import contact_share, from_rival
-from .cap_tiles import ABX, ABY, AX, AXX, AY, AYY, BX, BXX, BY, BYY, CX, CY, LITS, PART, WHOLE
+from .cap_tiles import LITS, WHOLE
 from .cap_vectors import above_zero, lanes_from, lowest, sum_of_16, weighed
 from .compile import fused, fused_part
 from .prefetch import to_read
 
 RAYS, LANES = 16, np.uint64(16)
-TOGETHER, HOLDS = 4, 112  # pixels whose rays are traced at once, and, at most, of a row: two where caps meet
+TOGETHER = 4  # pixels whose rays are traced at once
 FORMS = ((8, 2), (2, 8), (4, 4))
 """Rays along and down a pixel: towards the middle of a cap beside it, above or below it, and in other directions."""
 STEEP = 1.73  # tan of the angle from which it is beside, or above
 WIDER = np.float32(1.8)
 """Area of a box over that of the part of a patch that a ray stands for."""
 SOFTEST = np.float32(1e-3)  # less is lost in rounding
+NOWHERE = np.uint32((1 << 32) - 1)
+WHITE = np.float32(255)
 SIZE_BITS, NO_BOX = 27, 31
 """From which bit on a box's number holds its size; and the size that is the image itself."""
 
@@ -70,41 +72,13 @@ def slopes_of_row(tile: Any, t: Any, slopes: Any) -> None:
             slopes[3 * plane + power] = tile[plane, 1, power] + (t + t) * tile[plane, 2, power]
 
 
-@fused
-def cut_patches(s: Any, low: Any, high: Any, line: Any, slopes: Any, rays: Any) -> None:
-    """Leave of the patches of a row, lanes low to before high, what the cap shows where it hides a part of a pixel.
-
-    The part is taken for one side of the pixel, of which the contact line cuts off the other. s, line, slopes: see
-    `set_out`.
-    """
-    for lane in range(low, high):
-        j, share = np.uint64(lane), rays[HIDDEN + np.uint64(lane)]
-        if not (ZERO < share < ONE and rays[LITS + j] == WHOLE) or rays[RIVAL + j] > ZERO:
-            continue
-        at = s + np.float32(np.int32(lane))
-        px, py = _at(line, 0, at), _at(line, 1, at)
-        along = px * _along(line, 0, at) + py * _along(line, 1, at)  # how the distance from the axis grows
-        down = px * _at(slopes, 0, at) + py * _at(slopes, 1, at)
-        middle = HALF * (ONE - share)
-        rays[PART + j] *= share
-        if abs(along) > abs(down):
-            middle = -middle if along > ZERO else middle
-            _cut(CX, AX, AXX, BX, ABX, middle, share, rays, j)
-            _cut(CY, AY, AYY, BY, ABY, middle, share, rays, j)
-        else:
-            middle = -middle if down > ZERO else middle
-            _cut(CX, BX, BXX, AX, ABX, middle, share, rays, j)
-            _cut(CY, BY, BYY, AY, ABY, middle, share, rays, j)
-
-
 @fused_part
-def _cut(own: Any, once: Any, twice: Any, other: Any, both: Any, middle: Any, share: Any, rays: Any, j: Any) -> None:
-    """A quadratic of a place on a pixel, as that of a place on a part of it: about its middle, a share as wide."""
-    rays[own + j] += middle * (rays[once + j] + HALF * middle * rays[twice + j])
-    rays[once + j] = share * (rays[once + j] + middle * rays[twice + j])
-    rays[twice + j] *= share * share
-    rays[other + j] += middle * rays[both + j]
-    rays[both + j] *= share
+def share_out(rays: Any, low: Any, high: Any) -> None:
+    """Give rays of their own to those pixels of a row, lanes low to before high, that are lit and that a contact line
+    cuts."""
+    for j in range(np.uint64(low), np.uint64(max(low, high))):
+        most = ONE if ZERO < rays[HIDDEN + j] < ONE else WHOLE
+        rays[LITS + j] = rays[LITS + j] if rays[LITS + j] < most else most
 
 
 @fused_part
@@ -159,8 +133,11 @@ def set_out(
         dx, dy, need = from_rival(caps, number, rival)
     x0, y0 = (px, py) if own else (px - dx, py - dy)
     cap = caps[which]
-    soft = softness(cap, x0, y0, kx, ky, xu * width, xv * height, yu * width, yv * height)
+    kz = np.float32(math.sqrt(np.float32(cap[CAP_INDEX] ** 2) - kx * kx - ky * ky))
+    soft = softness(cap, x0, y0, kx, ky, kz, xu * width, xv * height, yu * width, yv * height)
     soft = soft if soft > SOFTEST else SOFTEST
+    sharp, per_z = ONE / soft, -ONE / kz
+    zu, zv = per_z * (kx * au + ky * bu), per_z * (kx * av + ky * bv)
     far_x, far_y = np.float32(u - outlines[which, 0]), np.float32(v - outlines[which, 1])
     per, start_x, start_y = far_x * far_x + far_y * far_y, HALF * width - HALF, HALF * height - HALF
     per = WIDER * SMALLEST * part / (per if per > ONE else ONE)
@@ -171,9 +148,11 @@ def set_out(
         rays[PY + i] = y0 + (x * yu + y * yv)
         rays[KX + i] = kx + (x * au + y * av)
         rays[KY + i] = ky + (x * bu + y * bv)
+        rays[KZ + i] = kz + (x * zu + y * zv)
         rays[DIM + i] = dim
         rays[SHARE + i] = part
         rays[SPREAD + i] = soft
+        rays[SHARPNESS + i] = sharp
         rays[PER + i] = per
     if not near:
         return ONE
@@ -202,10 +181,10 @@ def trace_own(cap: Any, later: Any, view: Any, rays: Any, lanes: Any) -> None:
 
 
 @fused_part
-def softness(cap: Any, px: Any, py: Any, kx: Any, ky: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
+def softness(cap: Any, px: Any, py: Any, kx: Any, ky: Any, kz: Any, xu: Any, xv: Any, yu: Any, yv: Any) -> Any:
     """Half of how much the square of the wave vector's component along a cap's normal changes over a pixel's part."""
     q, curvature, depth = np.float32(cap[CAP_INDEX] ** 2), np.float32(cap[CAP_CURVATURE]), np.float32(cap[CAP_DEPTH])
-    b = np.float32(math.sqrt(q - kx * kx - ky * ky)) * depth + px * kx + py * ky
+    b = kz * depth + px * kx + py * ky
     gu, gv = b * (kx * xu + ky * yu) - q * (px * xu + py * yu), b * (kx * xv + ky * yv) - q * (px * xv + py * yv)
     return curvature * curvature * np.float32(math.sqrt(gu * gu + gv * gv))
 
@@ -246,87 +225,112 @@ def boxes_of_rays(
 
 
 @fused_part
-def hold(words: Any, scene: Any, starts: Any, rays: Any, at: Any, first: Any, to: Any, lane: Any) -> None:
-    """Call for the boxes of a pixel's rays, lanes from `first` on, and keep their numbers and weights from `to` on;
-    what rays show that look at the image itself is added at once to what the pixel of a lane shows."""
-    for j in range(LANES):
-        box = np.uint64(at[first + j])
-        size = box >> np.uint64(SIZE_BITS)
-        weight = rays[WEIGHT + first + j]
-        if size == np.uint64(NO_BOX):
-            for channel in range(scene.shape[2]):
-                part = pixel_value(scene, rays[SUB + first + j], rays[SUB + Y_ + first + j], channel)
-                rays[SHOWN + lane + lane + lane + np.uint64(channel)] += weight * part
-            at[np.uint64(64) + to + j] = np.uint32(0)
-            rays[HELD + to + j] = ZERO
-        else:
-            box = np.uint64(starts[size]) + (box & np.uint64((1 << SIZE_BITS) - 1))
-            to_read(words, box)
-            at[np.uint64(64) + to + j] = np.uint32(box)
-            rays[HELD + to + j] = weight
+def call_boxes(words: Any, starts: Any, lanes: Any, at: Any) -> bool:
+    """Have the boxes of rays brought from memory, `at` from `boxes_of_rays`, which gets their numbers among all; or
+    `NOWHERE` for those that look at the image itself. Returns whether some do."""
+    bits, rest, nothing, alone = np.uint64(SIZE_BITS), np.uint64((1 << SIZE_BITS) - 1), np.uint64(0), False
+    for j in range(np.uint64(lanes)):
+        box = np.uint64(at[j])
+        size = box >> bits
+        none = size == np.uint64(NO_BOX)
+        alone |= none
+        number = nothing if none else np.uint64(starts[size]) + (box & rest)
+        to_read(words, number)
+        at[j] = NOWHERE if none else np.uint32(number)
+    return alone
 
 
 @fused_part
-def show_held(words: Any, rays: Any, at: Any, first: Any, lane: Any) -> None:
-    """Add what the boxes hold that were called for to what a lane shows."""
-    red, green, blue, boxed = weighed(words, at, np.uint64(64) + first, rays, HELD + first)
-    k, boxed = SHOWN + lane + lane + lane, boxed * BIAS
-    rays[k] += red - boxed
-    rays[k + ONE_] += green - boxed
-    rays[k + TWO_] += blue - boxed
+def add_rays(words: Any, scene: Any, alone: bool, rays: Any, first: Any, at: Any, shown: Any) -> None:
+    """Add what a pixel's rays show, lanes from `first` on, to `shown`, (4,). alone: see `call_boxes`."""
+    if alone:
+        for j in range(first, first + LANES):
+            if at[j] == NOWHERE:
+                for channel in range(np.uint64(scene.shape[2])):
+                    value = pixel_value(scene, rays[SUB + j], rays[SUB + Y_ + j], channel)
+                    shown[channel] += rays[WEIGHT + j] * value
+                at[j], rays[WEIGHT + j] = np.uint32(0), ZERO
+    red, green, blue, boxed = weighed(words, at, first, rays, WEIGHT + first)
+    boxed *= BIAS
+    shown[0] += red - boxed
+    shown[1] += green - boxed
+    shown[2] += blue - boxed
 
 
 @fused_part
-def edges_of_words(
+def mix(out: Any, first: Any, channels: Any, shown: Any, hidden: Any) -> None:
+    """Mix what a pixel shows, its first byte at `first`, with what is there, where a cap hides it."""
+    for channel in range(np.uint64(channels)):
+        k = np.uint64(first) + channel
+        value = shown[channel] + (ONE - hidden) * np.float32(out[k]) + HALF
+        out[k] = np.uint8(np.int32(value if value < WHITE else WHITE))
+
+
+@fused
+def draw_own(
+    words: Any, scene: Any, starts: Any, last: Any, shift: Any, border: Any, cap: Any, outline: Any, later: Any,
+    view: Any, rays: Any, at: Any, pixels: Any, hidden: Any, shown: Any, out: Any,
+) -> None:  # fmt: skip
+    """Draw pixels whose rays have been set out."""
+    lanes = LANES * np.uint64(len(pixels))
+    trace_own(cap, later, view, rays, lanes)
+    boxes_of_rays(outline, last, shift, border, len(starts), rays, lanes, at)
+    alone = call_boxes(words, starts, lanes, at)
+    for i in range(np.uint64(len(pixels))):
+        shown[:] = ZERO
+        add_rays(words, scene, alone, rays, LANES * i, at, shown)
+        mix(out, pixels[i], scene.shape[2], shown, hidden[i])
+
+
+@fused_part
+def own_of_row(
     words: Any, scene: Any, starts: Any, last: Any, shift: Any, border: Any, s: Any, u: Any, v: Any, edge: Any,
     hangs: bool, tiny: bool, caps: Any, number: Any, outlines: Any, later: Any, view: Any, low: Any, high: Any,
-    line: Any, slopes: Any, rays: Any, at: Any, slots: Any,
-) -> None:  # fmt: skip
-    """Add what those pixels of a row show that have rays of their own to `SHOWN`; and what caps hide of them.
+    line: Any, slopes: Any, rays: Any, beams: Any, made: Any, at: Any, pixels: Any, hidden: Any, shown: Any,
+    width: Any, out: Any,
+) -> Any:  # fmt: skip
+    """Draw those pixels of a row that have rays of their own, as soon as there are `TOGETHER` of them; take them out of
+    `HIDDEN`. Returns how many are left, set out among `beams`; made: how many were.
 
-    Up to four pixels' rays are traced at once. u, v: column of lane 0, and row. line, slopes: of the row. at: (64 +
-    16 HOLDS,) uint32; slots: (HOLDS,) int64.
+    u, v: column of lane 0, and row. line, slopes: of the row. beams: rays of these pixels, planes as `rays` has. at:
+    (64,) uint32; pixels, hidden: (`TOGETHER`,) of each the number of its first byte in `out`, and the share hidden.
     """
-    held, made = 0, 0  # pixels whose boxes have been called for, and others whose rays are set out
     for each in range(np.uint64(64)):
         others = rays[HIDDEN + each] if rays[RIVAL + each] > ZERO else ZERO
         rays[MARK + each] = rays[HIDDEN + each] if tiny or rays[LITS + each] == ONE else others
     left = lanes_from(above_zero(rays, MARK), low, high)
-    while left or made > 0:
-        j = lowest(left) if left else np.uint64(0)
-        lane, owns = np.int64(j), left > np.uint64(0)
+    while left:
+        j = lowest(left)
         left &= left - ONE_
-        rival = np.int64(rays[RIVAL + j]) - 1 if owns else -1
-        if made > 0 and (made == TOGETHER or rival >= 0 or not owns):
-            trace_own(caps[number], later, view, rays, made * RAYS)
-            boxes_of_rays(outlines[number], last, shift, border, len(starts), rays, made * RAYS, at)
-            for i in range(np.uint64(made)):
-                pixel = np.uint64(slots[np.uint64(held) + i])
-                hold(words, scene, starts, rays, at, LANES * i, LANES * (np.uint64(held) + i), pixel)
-            held, made = held + made, 0
-        if not owns:
-            continue
+        lane, rival = np.int64(j), np.int64(rays[RIVAL + j]) - 1
         form, at_s = form_of(u + lane, v, outlines[number], tiny, rival), s + np.float32(lane)
+        before, pixel = rays[HIDDEN + j], ((v * width + u) + lane) * scene.shape[2]
+        rays[HIDDEN + j] = ZERO
         if rival < 0:
             near = not rays[ROOM + j] > edge
-            hidden = set_out(
-                at_s, u + lane, v, near, form, number, caps, number, rival, outlines, line, slopes, rays,
+            share = set_out(
+                at_s, u + lane, v, near, form, number, caps, number, rival, outlines, line, slopes, beams,
                 LANES * np.uint64(made),
             )  # fmt: skip
-            slots[np.uint64(held + made)] = lane
+            pixels[made], hidden[made] = pixel, max(share, before) if hangs and not tiny else min(share, ONE)
             made += 1
-        else:
-            hidden = ZERO
-            for which in (number, rival):
-                hidden += set_out(
-                    at_s, u + lane, v, True, form, which, caps, number, rival, outlines, line, slopes, rays,
-                    np.uint64(0),
+            if made == TOGETHER:
+                draw_own(
+                    words, scene, starts, last, shift, border, caps[number], outlines[number], later, view, beams, at,
+                    pixels, hidden, shown, out,
                 )  # fmt: skip
-                trace_own(caps[which], later, view, rays, RAYS)
-                boxes_of_rays(outlines[which], last, shift, border, len(starts), rays, RAYS, at)
-                hold(words, scene, starts, rays, at, np.uint64(0), LANES * np.uint64(held), j)
-                slots[np.uint64(held)] = lane
-                held += 1
-        rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
-    for i in range(np.uint64(held)):
-        show_held(words, rays, at, LANES * i, np.uint64(slots[i]))
+                made = 0
+            continue
+        share = ZERO
+        shown[:] = ZERO
+        for which in (number, rival):
+            share += set_out(
+                at_s, u + lane, v, True, form, which, caps, number, rival, outlines, line, slopes, rays,
+                np.uint64(0),
+            )  # fmt: skip
+            trace_own(caps[which], later, view, rays, LANES)
+            boxes_of_rays(outlines[which], last, shift, border, len(starts), rays, LANES, at)
+            alone = call_boxes(words, starts, LANES, at)
+            add_rays(words, scene, alone, rays, np.uint64(0), at, shown)
+        mix(out, pixel, scene.shape[2], shown, max(share, before) if hangs and not tiny else min(share, ONE))
+    return made

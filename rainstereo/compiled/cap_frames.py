@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 
 from .cap_edges import (
-    HOLDS,
     RAYS,
+    TOGETHER,
+    WHITE,
     boxes_of_rays,
-    cut_patches,
-    edges_of_words,
+    draw_own,
     form_of,
     has_own,
+    own_of_row,
     set_out,
+    share_out,
     slopes_of_row,
     trace_own,
 )
@@ -48,19 +50,18 @@ from .compile import fused, fused_part
 from .layout import DRAW, FILL
 from .prefetch import to_write
 
-WHITE = np.float32(255)
 EIGHT = np.uint64(8)
 
 
 @fused
 def frame(
-    mode: Any, out: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, looks: Any,
+    mode: Any, out: Any, size: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, looks: Any,
     nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
-    record: Any,
+    record: Any, desk: Any,
 ) -> None:  # fmt: skip
     """Go over the pixels of caps, in the order of the caps.
 
-    mode: DRAW: into `out`, (H, W, C) of up to three channels of bytes, which holds the clear image, from boxes of the
+    mode: DRAW: into `out`, (H W C,) of up to three channels of bytes, which holds the clear image, from boxes of the
     scene in `words`. COUNT: how many pixels and taps there are, to record's counters. FILL: write them to record.
     scene: (h, w, C) bytes; only its size matters unless drawing. boxes: starts, widths, inverse distances (`boxes`).
     border, shift: how the scene goes on, and where the frame is in it. looks: grids, how many looks each has, how many
@@ -70,17 +71,15 @@ def frame(
     """
     starts, pitches, inverses = boxes
     grids, counts, fines, bands = looks
-    height, width = out.shape[0], out.shape[1]
+    width, height = size
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
-    rays, line = np.zeros(PLANES * 64, dtype=np.float32), np.zeros(15, dtype=np.float32)
-    tile, slopes, total = np.zeros((5, 3, 3), np.float32), np.zeros(12, np.float32), np.zeros(4, np.float32)
-    at, quarters = np.zeros(64 + HOLDS * RAYS, np.uint32), np.zeros(ROUND * 64, np.uint32)
-    slots, held = np.zeros((3, ROUND), np.int64), np.zeros(HOLDS, np.int64)
+    rays, line, tile, slopes, total, at, quarters, slots, beams, pixels, hidden = desk
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
             continue
         left, right, top, bottom = bounds(outline, width, height)
+        made = 0
         for v1 in range(top, bottom, TILE):
             v2 = min(v1 + TILE, bottom)
             for u1 in range(left, right, TILE):
@@ -96,7 +95,7 @@ def frame(
                 following = next_span(tile, np.float32(v1) - v0, s, lanes, cap, edge, line, rays)
                 for v in range(v1, v2):
                     low, high = following
-                    call_for(out, v + 2, v2, u1, lanes)
+                    call_for(out, width, scene.shape[2], v + 2, v2, u1, lanes)
                     t = np.float32(v) - v0
                     move_up(rays)
                     following = (0, 0)
@@ -115,8 +114,7 @@ def frame(
                         taken(tile, t, s, u1, v, lanes, wide, caps, number, rivals, outlines, line, rays)
                     of_row(tile, t, line)
                     slopes_of_row(tile, t, slopes)
-                    if not hangs:
-                        cut_patches(s, max(low, begin), min(high, end), line, slopes, rays)
+                    share_out(rays, begin, end)
                     if mode != DRAW:
                         record_row(
                             mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, edge, caps,
@@ -132,11 +130,16 @@ def frame(
                             words, scene, starts, pitches, inverses, last, border, grids, counts, fines, begin, end,
                             rays, total, at, quarters, slots,
                         )  # fmt: skip
-                    edges_of_words(
+                    made = own_of_row(
                         words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
-                        later, view, low, high, line, slopes, rays, at, held,
+                        later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden, total, width, out,
                     )  # fmt: skip
-                    write_bytes(out, v, u1, lanes, rays)
+                    write_bytes(out, width, scene.shape[2], v, u1, lanes, rays)
+        if made > 0:
+            draw_own(
+                words, scene, starts, last, shift, border, cap, outline, later, view, beams, at, pixels[:made],
+                hidden[:made], total, out,
+            )  # fmt: skip
 
 
 @fused
@@ -192,31 +195,40 @@ def record_row(
         cursor[PIXELS] += 1
 
 
+def desk() -> tuple[Any, ...]:
+    """Room for what `frame` works on."""
+    return (
+        np.zeros(PLANES * 64, np.float32), np.zeros(15, np.float32), np.zeros((5, 3, 3), np.float32),
+        np.zeros(12, np.float32), np.zeros(4, np.float32), np.zeros(ROUND * 64, np.uint32),
+        np.zeros(ROUND * 64, np.uint32), np.zeros((3, ROUND), np.int64), np.zeros(PLANES * 64, np.float32),
+        np.zeros(TOGETHER, np.int64), np.zeros(TOGETHER, np.float32),
+    )  # fmt: skip
+
+
 @fused_part
-def call_for(out: Any, v: Any, stop: Any, u: Any, lanes: Any) -> None:
+def call_for(out: Any, width: Any, channels: Any, v: Any, stop: Any, u: Any, lanes: Any) -> None:
     """Have a row's pixels, before `stop`, brought from memory."""
     if v < stop:
-        every, channels, line = out.ravel(), np.uint64(out.shape[2]), np.uint64(64)
-        first = (np.uint64(v) * np.uint64(out.shape[1]) + np.uint64(u)) * channels
-        for k in range(first, first + np.uint64(lanes) * channels, line):
-            to_write(every, k)
+        first, line = np.uint64((v * width + u) * channels), np.uint64(64)
+        for k in range(first, first + np.uint64(lanes * channels), line):
+            to_write(out, k)
 
 
 @fused_part
-def write_bytes(out: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
+def write_bytes(out: Any, width: Any, of_pixel: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
     """Mix what a row shows with what is there, where a cap hides it."""
-    channels, three, block = np.uint64(out.shape[2]), np.uint64(3), np.uint64(32)
-    row, first = out[v].ravel(), np.uint64(u) * channels
+    channels, three, block = np.uint64(of_pixel), np.uint64(3), np.uint64(32)
+    first, stop = np.uint64((v * width + u) * of_pixel), np.uint64((v + 1) * width * of_pixel)
     if channels == three:
         count = (three * np.uint64(lanes) + block - np.uint64(1)) // block * block  # whole vectors
         for j in range(np.uint64(0), (count + three - np.uint64(1)) // three, EIGHT):  # beyond the lanes, all is clear
             thrice(rays, HIDDEN + j, COVER + three * j)
-        for k in range(min(count, np.uint64(len(row)) - first)):
-            value = rays[SHOWN + k] + (ONE - rays[COVER + k]) * np.float32(row[first + k]) + HALF
-            row[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))
+        for k in range(min(count, stop - first)):
+            value = rays[SHOWN + k] + (ONE - rays[COVER + k]) * np.float32(out[first + k]) + HALF
+            out[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))
         return
     for j in range(np.uint64(lanes)):
         for channel in range(channels):
             k, at = three * j + channel, first + j * channels + channel
-            value = rays[SHOWN + k] + (ONE - rays[HIDDEN + j]) * np.float32(row[at]) + HALF
-            row[at] = np.uint8(np.int32(value if value < WHITE else WHITE))
+            value = rays[SHOWN + k] + (ONE - rays[HIDDEN + j]) * np.float32(out[at]) + HALF
+            out[at] = np.uint8(np.int32(value if value < WHITE else WHITE))

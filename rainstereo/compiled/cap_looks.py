@@ -27,6 +27,7 @@ from .cap_tiles import (
     BYY,
     CX,
     CY,
+    EIGHTS,
     FAR,
     GAINS,
     GRID,
@@ -34,7 +35,7 @@ from .cap_tiles import (
     PART,
     WHOLE,
 )  # fmt: skip
-from .cap_vectors import above_zero, lanes_from, lowest, sum_of_words
+from .cap_vectors import above, above_zero, lanes_from, lowest, sum_of_words
 from .compile import fused, fused_part
 from .prefetch import to_read
 
@@ -126,9 +127,9 @@ def patch_of_pixels(scene: Any, last: Any, border: Any, rays: Any, j: Any, total
 @fused_part
 def places(
     fine: bool, start: Any, pitch: Any, inverse: Any, last: Any, border: Any, rays: Any, j: Any, grids: Any,
-    grid: Any, count: Any, at: Any, first: Any, parts: Any,
+    grid: Any, room: Any, at: Any, first: Any, parts: Any,
 ) -> None:  # fmt: skip
-    """Numbers of the boxes that a patch looks at, to `at`, uint32, from `first` on.
+    """Numbers of the boxes that a patch looks at, to `at`, uint32, from `first` on; room: so many, whole vectors.
 
     start, pitch, inverse: of the boxes' size. grid: where a grid begins among `grids` (`T_`). fine: of the upper left
     of four boxes; and how far a look lies from it, quarters of their distance along and 4 times those down, to `parts`.
@@ -138,7 +139,7 @@ def places(
     cx, cy, ax, ay, bx, by = rays[CX + j], rays[CY + j], rays[AX + j], rays[AY + j], rays[BX + j], rays[BY + j]
     axx, ayy, bxx, byy = rays[AXX + j], rays[AYY + j], rays[BXX + j], rays[BYY + j]
     abx, aby, number, line = rays[ABX + j], rays[ABY + j], np.int32(start), np.int32(pitch)
-    for look in range(np.uint64((count + 7) // 8 * 8)):
+    for look in range(np.uint64(room)):
         k = grid + look
         s, t, ss, tt, st = grids[k], grids[T_ + k], grids[SS + k], grids[TT + k], grids[ST + k]
         x = cx + (s * ax + t * bx) + (ss * axx + tt * bxx) + st * abx
@@ -193,9 +194,60 @@ def whole_of_words(
     uint32 twice, and (3, ROUND) int64.
     """
     for each in range(np.uint64(64)):
-        shown = rays[HIDDEN + each] if rays[LITS + each] == WHOLE else ZERO
+        shown = rays[EIGHTS + each] if rays[HIDDEN + each] > ZERO else ZERO
+        shown = shown if rays[LITS + each] == WHOLE else ZERO
         rays[MARK + each] = ZERO if rays[RIVAL + each] > ZERO else shown
-    left = lanes_from(above_zero(rays, MARK), low, high)
+    every = lanes_from(above_zero(rays, MARK), low, high)
+    two, three = above(rays, MARK, np.float32(1.5)), above(rays, MARK, np.float32(2.5))
+    four, five = above(rays, MARK, np.float32(3.5)), above(rays, MARK, np.float32(4.5))
+    others = every & above(rays, MARK, np.float32(5.5))
+    # one after the other, since each is of machine code of its own, without a branch
+    _of_eights(1, every & ~two, words, starts, pitches, inverses, grids, counts, rays, at)
+    _of_eights(2, every & two & ~three, words, starts, pitches, inverses, grids, counts, rays, at)
+    _of_eights(3, every & three & ~four, words, starts, pitches, inverses, grids, counts, rays, at)
+    _of_eights(4, every & four & ~five, words, starts, pitches, inverses, grids, counts, rays, at)
+    _of_eights(5, every & five & ~others, words, starts, pitches, inverses, grids, counts, rays, at)
+    if others:
+        _others(
+            words, scene, starts, pitches, inverses, last, border, grids, counts, fines, others, rays, total, at,
+            parts, slots,
+        )  # fmt: skip
+
+
+@fused_part
+def _of_eights(
+    eights: int, left: Any, words: Any, starts: Any, pitches: Any, inverses: Any, grids: Any, counts: Any, rays: Any,
+    at: Any,
+) -> None:  # fmt: skip
+    """The lanes of `left`, of which each has up to so many eights of looks, at one box each, inside the scene."""
+    nowhere, room, nothing = (ZERO, ZERO), np.uint64(8 * eights), np.uint64(0)
+    while left:
+        made, coming = nothing, left
+        while left and made < np.uint64(ROUND):
+            j = lowest(left)
+            left &= left - ONE_
+            grid, size = np.uint64(np.int64(rays[GRID + j])), np.uint64(size_of(rays[PART + j], len(inverses)))
+            places(
+                False, starts[size], pitches[size], inverses[size], nowhere, INSIDE, rays, j, grids, grid * OF_GRID,
+                8 * eights, at, room * made, at,
+            )  # fmt: skip
+            for look in range(room):
+                to_read(words, np.uint64(at[room * made + look]))
+            made += ONE_
+        for i in range(made):
+            j = lowest(coming)
+            coming &= coming - ONE_
+            count = counts[np.uint64(np.int64(rays[GRID + j]))]
+            found, unit = sum_of_words(words, at, room * i, np.uint64(count), room), ONE / np.float32(count)
+            show(rays, j, found, rays[GAINS + j] * rays[HIDDEN + j] * unit, BIAS / unit)
+
+
+@fused_part
+def _others(
+    words: Any, scene: Any, starts: Any, pitches: Any, inverses: Any, last: Any, border: Any,
+    grids: Any, counts: Any, fines: Any, left: Any, rays: Any, total: Any, at: Any, parts: Any, slots: Any,
+) -> None:  # fmt: skip
+    """The lanes of `left`, whatever they look at."""
     while left:
         made = 0
         while left and made < ROUND:
@@ -220,17 +272,77 @@ def whole_of_words(
             on = border if not rays[FAR + j] >= ZERO else INSIDE
             if grid < fines:
                 if on == INSIDE:
-                    places(True, start, pitch, one, last, INSIDE, rays, j, grids, of_grid, count, at, first, parts)
+                    places(
+                        True,
+                        start,
+                        pitch,
+                        one,
+                        last,
+                        INSIDE,
+                        rays,
+                        j,
+                        grids,
+                        of_grid,
+                        (count + 7) // 8 * 8,
+                        at,
+                        first,
+                        parts,
+                    )
                 else:
-                    places(True, start, pitch, one, last, on, rays, j, grids, of_grid, count, at, first, parts)
+                    places(
+                        True,
+                        start,
+                        pitch,
+                        one,
+                        last,
+                        on,
+                        rays,
+                        j,
+                        grids,
+                        of_grid,
+                        (count + 7) // 8 * 8,
+                        at,
+                        first,
+                        parts,
+                    )
                 for look in range(first, first + np.uint64(count)):
                     to_read(words, np.uint64(at[look]))
                     to_read(words, np.uint64(at[look]) + np.uint64(pitch))
             else:
                 if on == INSIDE:
-                    places(False, start, pitch, one, last, INSIDE, rays, j, grids, of_grid, count, at, first, parts)
+                    places(
+                        False,
+                        start,
+                        pitch,
+                        one,
+                        last,
+                        INSIDE,
+                        rays,
+                        j,
+                        grids,
+                        of_grid,
+                        (count + 7) // 8 * 8,
+                        at,
+                        first,
+                        parts,
+                    )
                 else:
-                    places(False, start, pitch, one, last, on, rays, j, grids, of_grid, count, at, first, parts)
+                    places(
+                        False,
+                        start,
+                        pitch,
+                        one,
+                        last,
+                        on,
+                        rays,
+                        j,
+                        grids,
+                        of_grid,
+                        (count + 7) // 8 * 8,
+                        at,
+                        first,
+                        parts,
+                    )
                 for look in range(first, first + np.uint64(count)):
                     to_read(words, np.uint64(at[look]))
             slots[np.uint64(0), np.uint64(made)], slots[ONE_, np.uint64(made)] = np.int64(j), count
@@ -242,6 +354,6 @@ def whole_of_words(
             found = (
                 sum_of_means(words, pitch, at, parts, np.uint64(64) * i, count)
                 if pitch
-                else sum_of_words(words, at, np.uint64(64) * i, np.uint64(count))
+                else sum_of_words(words, at, np.uint64(64) * i, np.uint64(count), np.uint64((count + 7) // 8 * 8))
             )
             show(rays, j, found, rays[GAINS + j] * rays[HIDDEN + j] * unit, BIAS / unit)

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from .cap_lanes import through_hard, through_soft, to_scene
 from .compile import fused_part
 
 PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
-OWN, SIDES, ABOVE, BELOW = (np.uint64(64 * i) for i in (11, 14, 17, 20))
-"""Rays of a row of pixels: through their middles, the middles of their left sides, and their upper and lower left
-corners; places, and gain."""
-SUB = np.uint64(64 * 23)  # of one pixel
-PATCH = np.uint64(64 * 26)
+OWN, ABOVE, BELOW = (np.uint64(64 * i) for i in (11, 14, 17))
+"""Rays of a row of pixels: through their middles, and their upper and lower left corners; places, and gain."""
+SUB = np.uint64(64 * 20)  # of one pixel
+PATCH = np.uint64(64 * 23)
 HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))
 """Of a row: the share of each pixel that a cap hides; and 1 + the number of another that shows some of it, or 0."""
 SHOWN, COVER = np.uint64(64 * 45), np.uint64(64 * 48)
@@ -30,11 +30,10 @@ SHOWN, COVER = np.uint64(64 * 45), np.uint64(64 * 48)
 WEIGHT, STRETCH = np.uint64(64 * 51), np.uint64(64 * 52)
 SPREAD, PER = np.uint64(64 * 53), np.uint64(64 * 54)
 """Of a pixel's own rays: see `cross`, and how a box's size follows from how far a ray looks (`cap_edges`)."""
-HELD = np.uint64(64 * 55)
-"""Weights of rays whose boxes are on their way from memory."""
-MARK = np.uint64(64 * 83)
+MARK = np.uint64(64 * 55)
 """Of a row: above 0 in the lanes that something is to be done about."""
-PLANES = 84
+SHARPNESS = np.uint64(64 * 56)  # 1 / `SPREAD`
+PLANES = 57
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
 ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
@@ -121,57 +120,19 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
 
     The gain is 0 where no light comes through. later: (F, 3) float32, thickness before a face and the indices
     on both sides, of the faces behind the cap's.
-    soft: each ray stands for light about it, over which the square of the wave vector's component along the normal
-    behind the cap goes from `SPREAD` below to as much above the ray's. That component is what places and gains depend
-    on, nearly linearly, also where it ends, at the critical angle, and they as steeply as a square root: so its mean
-    gives the light's gain, and its mean weighted with itself the light's middle. The plane `STRETCH` gets the component
-    before the cap's surface over that behind it.
+    soft: the components of wave vectors along the panel's normal, `KZ`, are known, and each ray stands for light about
+    it, over which the square of the wave vector's component along the normal behind the cap goes from `SPREAD` below to
+    as much above the ray's. That component is what places and gains depend on, nearly linearly, also where it ends, at
+    the critical angle, and they as steeply as a square root: so its mean gives the light's gain, and its mean weighted
+    with itself the light's middle. The plane `STRETCH` gets the component before the cap's surface over that behind it.
     """
     square, depth, curvature = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH]), np.float32(cap[CAP_CURVATURE])
-    n = np.float32(cap[CAP_INDEX])
-    q = n * n
-    inverse, less = ONE / q, ONE - q
-    a_third, a_fourth = np.float32(1 / 3), np.float32(0.25)
+    q = np.float32(cap[CAP_INDEX]) * np.float32(cap[CAP_INDEX])
     first, last = np.uint64(low), np.uint64(high)
-    for j in range(first, last):
-        px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
-        kz = np.float32(math.sqrt(q - kx * kx - ky * ky))
-        room = square - px * px - py * py
-        b = kz * depth + px * kx + py * ky
-        root = np.float32(math.sqrt(b * b + room * q))
-        # the root of the quadratic, as the product of both roots over the other
-        s = room / (b + root) if b >= ZERO else (root - b) * inverse
-        before = root * curvature  # component of the wave vector along the sphere's normal
-        inside = before * before + less
-        turned = mean = np.float32(math.sqrt(inside))
-        if soft:
-            spread = rays[SPREAD + j]
-            per = ONE / spread
-            high, low_ = inside + spread, inside - spread
-            high, low_ = (high if high > ZERO else ZERO), (low_ if low_ > ZERO else ZERO)
-            mean = (high * np.float32(math.sqrt(high)) - low_ * np.float32(math.sqrt(low_))) * (a_third * per)
-            turned = (high + low_) * (high - low_) * (a_fourth * per) / (mean if mean > ZERO else ONE)
-            inside = high
-        p, t = before + q * turned, before + turned
-        both = ONE / (p * t)
-        bend = less * curvature * (p * both)
-        passed = (before * mean + before * mean) * (p * p + q * t * t) * (both * both)
-        rise = s * kz
-        px += s * kx
-        py += s * ky
-        up = kz + bend * (rise + depth)
-        if soft:
-            drawn_out = before / turned
-            rays[STRETCH + j] = drawn_out if turned > ZERO else ZERO
-        rays[PX + j] = px
-        rays[PY + j] = py
-        rays[RISE + j] = rise
-        rays[KX + j] = kx + bend * px
-        rays[KY + j] = ky + bend * py
-        rays[KZ + j] = up
-        # beside the contact circle the sphere goes on below the face, for pixels at the edge, unless it hangs over
-        inside = inside if b >= ZERO or room > ZERO else ZERO
-        rays[to + GAIN + j] = passed * rays[DIM + j] if inside > ZERO and up > ZERO else ZERO
+    if soft:
+        through_soft(rays, first, last, to, square, depth, curvature, q)
+    else:
+        through_hard(rays, first, last, to, square, depth, curvature, q)
     for face in range(len(later)):
         thick, q1, q2 = later[face, 0], later[face, 1] * later[face, 1], later[face, 2] * later[face, 2]
         for j in range(first, last):
@@ -186,28 +147,17 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
             pt = p * t
             passed = (kz * turned + kz * turned) * (p * p + q1 * q2 * t * t) / (pt * pt)
             rays[KZ + j] = turned
-            rays[to + GAIN + j] = rays[to + GAIN + j] * passed if inside > ZERO else ZERO
+            rays[to + GAIN + j] *= passed if inside > ZERO else ZERO
     _project(np.float32(cap[CAP_X]), np.float32(cap[CAP_Y]), view, rays, first, last, to)
 
 
 @fused_part
 def _project(cx: Any, cy: Any, view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
     """Where the camera sees what the rays meet at the scene's depth."""
-    m0, m1, m2, m3, m4, m5, m6, m7, m8 = view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8]
-    u0, v0, end, inverse = view[VIEW_C], view[VIEW_C + 1], view[VIEW_Z], view[VIEW_INVERSE]
-    for j in range(first, last):
-        kx, ky, kz = rays[KX + j], rays[KY + j], rays[KZ + j]
-        x, y, z = rays[PX + j] + cx, rays[PY + j] + cy, rays[RISE + j] + end
-        dz = m6 * kx + m7 * ky + m8 * kz
-        oz = m6 * x + m7 * y + m8 * z
-        per = ONE / dz
-        du = (m0 * kx + m1 * ky + m2 * kz) * per
-        dv = (m3 * kx + m4 * ky + m5 * kz) * per
-        rays[to + j] = du + ((m0 * x + m1 * y + m2 * z) - oz * du) * inverse + u0
-        rays[to + Y_ + j] = dv + ((m3 * x + m4 * y + m5 * z) - oz * dv) * inverse + v0
-        gain = rays[to + GAIN + j]
-        gain = gain if gain > ZERO else ZERO  # not NaN
-        rays[to + GAIN + j] = gain if dz > ALONG and oz * inverse < ONE else ZERO
+    to_scene(
+        rays, first, last, to, cx, cy, view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8],
+        view[VIEW_C], view[VIEW_C + 1], view[VIEW_Z], view[VIEW_INVERSE], ALONG,
+    )  # fmt: skip
     if len(view) > VIEW_LENS:
         _distort(view, rays, first, last, to)
 

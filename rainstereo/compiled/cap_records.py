@@ -55,9 +55,10 @@ def record_whole(
                 _bilinear(texels, weights, cursor, filling, first, size, x, y, gain / np.float32(across * down))
         return
     start, pitch, inverse, count = starts[k], pitches[k], inverses[k], counts[grid]
+    room = (count + 7) // 8 * 8
     on, part = border if not rays[FAR + j] >= ZERO else INSIDE, gain / np.float32(count)
     if grid < np.uint64(fines):
-        places(True, start, pitch, inverse, last, on, rays, j, grids, grid * OF_GRID, count, at, begin, parts)
+        places(True, start, pitch, inverse, last, on, rays, j, grids, grid * OF_GRID, room, at, begin, parts)
         for look in range(np.uint64(count)):
             box, far = np.int64(at[look]), np.int64(parts[look])
             u, v = np.float32(far & 3) / np.float32(4), np.float32(far >> 2) / np.float32(4)
@@ -66,7 +67,7 @@ def record_whole(
             _tap(texels, weights, cursor, filling, box + pitch, part * v * (ONE - u))
             _tap(texels, weights, cursor, filling, box + pitch + 1, part * v * u)
         return
-    places(False, start, pitch, inverse, last, on, rays, j, grids, grid * OF_GRID, count, at, begin, parts)
+    places(False, start, pitch, inverse, last, on, rays, j, grids, grid * OF_GRID, room, at, begin, parts)
     for look in range(np.uint64(count)):
         _tap(texels, weights, cursor, filling, np.int64(at[look]), part)
 

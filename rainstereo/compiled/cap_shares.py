@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .cap_lanes import SIDE, side_sum
 from .cap_rays import (
     CAP_CURVATURE,
     CAP_DEPTH,
@@ -33,14 +34,14 @@ from .cap_rays import (
     take_up,
 )
 from .cap_tiles import OUT_RADIUS, OUT_RIVAL, OUT_RIVALS, OUT_X, OUT_Y, along, down, value_on
-from .cap_vectors import above_zero, lanes_from, lowest
+from .cap_vectors import above, above_zero, ends, lanes_from, lowest
 from .compile import compiled, fused, fused_part
 
-SIDE = 4  # samples along a pixel's side where a cap hangs over
 SAGITTA = np.float32(1.1 / 24)
 """How far an arc is from its tangent in the mean, over the square of its length and its curvature: 1/24; arcs across a
 pixel are somewhat longer than its side."""
 FAR_LESS = np.float32(1e9)  # room: none at all
+FEW = 24  # lanes all of whose shares are computed
 ALIKE = 1e-6  # of a cap's room: less of a difference is rounding
 
 
@@ -84,45 +85,30 @@ def side_share(px: Any, py: Any, kx: Any, ky: Any, radius: Any, depth: Any, xu: 
         return ZERO
     if away > across and b < -across:
         return ONE
-    total = ZERO
-    for i in range(SIDE):
-        t = (np.float32(i) + HALF) / np.float32(SIDE) - HALF
-        for j in range(SIDE):
-            s = (np.float32(j) + HALF) / np.float32(SIDE) - HALF
-            x, y = px + s * xu + t * xv, py + s * yu + t * yv
-            r2 = x * x + y * y
-            away = radius - np.float32(math.sqrt(r2))
-            b = x * kx + y * ky + kz * depth
-            if b < ZERO:
-                gx, gy = b * kx - x, b * ky - y
-                meets = b * b + radius * radius - r2
-                away = max(away, HALF * meets / max(np.float32(math.sqrt(gx * gx + gy * gy)), np.float32(1e-12)))
-            total += min(max(HALF + away / across * np.float32(SIDE), ZERO), ONE)
-    return total / np.float32(SIDE * SIDE)
+    per = np.float32(SIDE) / across
+    return side_sum(px, py, kx, ky, kz, radius, depth, xu, xv, yu, yv, per) / np.float32(SIDE * SIDE)
 
 
 @fused_part
-def contacts(tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, line: Any, rays: Any) -> None:
-    """Fill the plane `HIDDEN` from low to before high with shares inside the contact circle; line: of the row."""
+def contacts(
+    tile: Any, t: Any, s: Any, low: Any, high: Any, edge: Any, cap: Any, line: Any, rays: Any
+) -> None:  # fmt: skip
+    """Fill the plane `HIDDEN` from low to before high, whole vectors, with shares inside the contact circle; line: of
+    the row; edge: see `shares_of_row`."""
     radius, two = np.float32(math.sqrt(cap[CAP_SQUARE])), t + t
     x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
     a0, a1, a2 = (tile[0, 1, 0] + two * tile[0, 2, 0], tile[0, 1, 1] + two * tile[0, 2, 1],
                   tile[0, 1, 2] + two * tile[0, 2, 2])  # fmt: skip
     b0, b1, b2 = (tile[1, 1, 0] + two * tile[1, 2, 0], tile[1, 1, 1] + two * tile[1, 2, 1],
                   tile[1, 1, 2] + two * tile[1, 2, 2])  # fmt: skip
-    for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
+    for j in range(np.uint64(low), np.uint64(high)):
         at = s + np.float32(np.int32(j))
         x, y = x0 + at * (x1 + at * x2), y0 + at * (y1 + at * y2)
         xu, yu = x1 + (at + at) * x2, y1 + (at + at) * y2
         xv, yv = a0 + at * (a1 + at * a2), b0 + at * (b1 + at * b2)
         share = contact_share(x, y, radius, xu, xv, yu, yv)
-        rays[HIDDEN + j] = share if share > ZERO else ZERO
-
-
-@fused_part
-def _is_inside(rays: Any, lane: Any, edge: Any) -> Any:
-    """Whether eight lanes surely are inside the contact circle."""
-    return rays[ROOM + np.uint64(lane)] > edge and rays[ROOM + np.uint64(lane + 7)] > edge
+        share = share if share > ZERO else ZERO
+        rays[HIDDEN + j] = ONE if rays[ROOM + j] > edge else share
 
 
 @fused_part
@@ -140,14 +126,14 @@ def shares_of_row(
         rays[RIVAL + j] = ZERO
     of_row(tile, t, line)
     first, last = low // 8 * 8, (high + 7) // 8 * 8
-    left, right = first, last  # whole vectors inside the circle: a row meets it in one piece
-    while left < last and not _is_inside(rays, left, edge):
-        left += 8
-    while right > left and not _is_inside(rays, right - 8, edge):
-        right -= 8
-    for side in range(2):
-        begin, end = (first, left) if side == 0 else (right, last)
-        contacts(tile, t, s, begin, end, cap, line, rays)
+    if last - first <= FEW:
+        contacts(tile, t, s, first, last, edge, cap, line, rays)
+    else:
+        sure = lanes_from(above(rays, ROOM, edge), low, high)  # a row meets the circle in one piece
+        left, right = ends(sure)
+        for side in range(2):
+            begin, end = (first, (left + 7) // 8 * 8) if side == 0 else (right // 8 * 8, last)
+            contacts(tile, t, s, begin, end if sure or side else last, edge, cap, line, rays)
     for j in range(np.uint64(lanes), np.uint64(64)):
         rays[HIDDEN + j] = ZERO
     if hangs:
@@ -227,8 +213,9 @@ def taken(
             by_side = room + b * b if b < ZERO else room
             more = room - (rays[ROOM + j] + need)
             more = more if by_side > -edge else -FAR_LESS
-            rays[HIDDEN + j] = ZERO if more > ZERO else rays[HIDDEN + j]
-            rays[RIVAL + j] = name if more > -part else rays[RIVAL + j]
+            rays[HIDDEN + j] *= ZERO if more > ZERO else ONE
+            near = ONE if more > -part else ZERO
+            rays[RIVAL + j] += near * (name - rays[RIVAL + j])
 
 
 @compiled

@@ -1,8 +1,8 @@
 """Tiles of caps, row by row: their rays, and what patch of the scene each pixel shows.
 
-Rays go through the corners of pixels and the middles of their left and right sides, which neighbours share; where all
-six of a pixel are lit, one more goes through its middle. What it shows is then known as a quadratic in the place on the
-pixel. Where a cap is lit is convex, or nearly so: four lit corners are a lit pixel.
+Rays go through the corners of pixels, which neighbours share; where all four of a pixel are lit, one more goes through
+its middle. What it shows is then known as a quadratic in the place on the pixel, whose bend along the row is that of
+its neighbours' middles. Where a cap is lit is convex, or nearly so: four lit corners are a lit pixel.
 """
 
 from __future__ import annotations
@@ -15,16 +15,21 @@ import numpy as np
 from .cap_rays import (
     ABOVE,
     BELOW,
+    CAP_CURVATURE,
     CAP_DEPTH,
+    CAP_INDEX,
     CAP_SQUARE,
-    FOUR,
     GAIN,
     HALF,
+    KX,
+    KY,
+    MARK,
     NEXT,
     OWN,
     PATCH,
+    PX,
+    PY,
     ROOM,
-    SIDES,
     Y_,
     ZERO,
     cross,
@@ -32,8 +37,10 @@ from .cap_rays import (
     room_of_row,
     take_up,
 )  # fmt: skip
+from .cap_vectors import above, ends, lanes_from
 from .compile import fused_part
 
+NEARLY = np.float32(1e-5)  # of the square of an index: what rounding may hide
 TILE = 56  # pixels along a side, at most
 TINY = 2.5
 """Contact radius, pixels, below which all pixels of a cap have many rays of their own."""
@@ -41,17 +48,21 @@ OUT_X, OUT_Y, OUT_RADIUS, OUT_RIVAL, OUT_RIVALS = range(5)
 """Columns of a table of outlines, float64: a circle in the image, and which of the list of rivals are the cap's."""
 WHOLE, PARTLY = np.float32(2), np.float32(1)
 """Of a pixel's rays beside it, whether all or only some are lit."""
-CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, PART, GRID, FAR, LITS = (
-    PATCH + np.uint64(64 * i) for i in range(17)
+CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, PART, GRID, FAR, LITS, EIGHTS = (
+    PATCH + np.uint64(64 * i) for i in range(18)
 )  # fmt: skip
 """Planes of patches: the middle of what a pixel shows; how places change along x (A) and y (B), twice along each, and
 along both; mean gain; area, square pixels, that one look stands for; the number of the grid of looks; pixels between
-what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0."""
-AREAS, AIMS, FIRSTS, PARTS = range(4)
+what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0; how many eights of looks it has, or `OTHER`."""
+AREAS, AIMS, FIRSTS, PARTS, ROOMS = range(5)
 """Columns of a table of bands: up to which area of a patch, how many looks it gets, from which grid on, and
-which part of the patch's area a box has."""
+which part of the patch's area a box has; eights of looks, or `OTHER`."""
+OTHER = np.float32(6)
+"""In place of how many eights of looks: for looks at four boxes each, and for those that may fall beyond the scene."""
 LARGEST = np.float32(110 * 110)
 """Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
+LARGEST_ALONE = np.float32(64 * 64)
+"""The same where a neighbour's middle is dark, so that it is less sure how the patch is bent."""
 
 
 @fused_part
@@ -88,12 +99,20 @@ def next_span(tile: Any, t: Any, s: Any, lanes: Any, cap: Any, slack: Any, line:
     """Fill the plane of room of a row, and say between which lanes its rays meet the contact circle, or nearly."""
     of_row(tile, t, line)
     room_of_row(line, s, (lanes + 7) // 8 * 8, np.float32(cap[CAP_SQUARE]), rays)
-    low, high = 0, lanes
-    while low < high and not rays[NEXT + np.uint64(low)] > -slack:
-        low += 1
-    while low < high and not rays[NEXT + np.uint64(high - 1)] > -slack:
-        high -= 1
-    return low, high
+    return ends(lanes_from(above(rays, NEXT, -slack), 0, lanes))
+
+
+@fused_part
+def lit_span(line: Any, s: Any, low: Any, high: Any, cap: Any, rays: Any) -> Any:
+    """Between which lanes rays that have been taken up come through the cap, or nearly."""
+    square, depth, curvature = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH]), np.float32(cap[CAP_CURVATURE])
+    q = np.float32(cap[CAP_INDEX] * cap[CAP_INDEX])
+    per, less = curvature * curvature, np.float32(1) - q
+    for j in range(np.uint64(low), np.uint64(high)):
+        px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
+        b = np.float32(math.sqrt(q - kx * kx - ky * ky)) * depth + px * kx + py * ky
+        rays[MARK + j] = (b * b + (square - px * px - py * py) * q) * per + less
+    return ends(lanes_from(above(rays, MARK, -NEARLY), low, high))
 
 
 @fused_part
@@ -122,24 +141,31 @@ def row_of_tile(
     first, last = span
     if following[0] < following[1]:
         first, last = (min(low, following[0]), max(high, following[1])) if low < high else following
-    for which in range(4):  # one after the other, so that the machine code for it is there once
-        down, across, begin, end, to = t, s - HALF, low, high + 1 if low < high else low, SIDES
-        if which == 1:
-            down, to = t - HALF, ABOVE
-            begin = begin if is_first else end
-        elif which == 2:
-            down, begin, end, to = t + HALF, first, last + 1 if first < last else first, BELOW
-        elif which == 3:
-            if not low < high:
-                return 0, 0
+    for which in range(3):  # one after the other, so that the machine code for it is there once
+        down, across, begin, end, to = t - HALF, s - HALF, low, high + 1, ABOVE
+        if which == 0:
+            if not (is_first and low < high):
+                continue
+        elif which == 1:
+            down, begin, end, to = t + HALF, first, last + 1, BELOW
+        else:
             lit(rays, low, high)
-            while low < high and rays[LITS + np.uint64(low)] != WHOLE:
-                low += 1
-            while low < high and rays[LITS + np.uint64(high - 1)] != WHOLE:
-                high -= 1
-            across, begin, end, to = s, low, high, OWN
-        if begin < end:
-            trace_lanes(tile, down, across, begin, end, cap, later, view, line, rays, to)
+            whole = lanes_from(above(rays, LITS, PARTLY), low, high)
+            if not whole:
+                return 0, 0
+            low, high = ends(whole)
+            down, across, begin, end, to = t, s, low, high, OWN
+            for j in range(np.uint64(64)):
+                rays[OWN + GAIN + j] = ZERO
+        if which < 2:
+            for j in range(np.uint64(64)):
+                rays[to + GAIN + j] = ZERO
+            of_row(tile, down, line)
+            take_up(line, across, begin, begin + (end - begin + 7) // 8 * 8, rays)
+            begin, end = lit_span(line, across, begin, end, cap, rays)
+            if begin == end:
+                continue
+        trace_lanes(tile, down, across, begin, end, cap, later, view, line, rays, to)
     return low, high
 
 
@@ -148,27 +174,29 @@ def lit(rays: Any, low: Any, high: Any) -> None:
     """Fill the plane `LITS` from low to before high."""
     one = np.uint64(1)
     for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
-        a, b, c = rays[SIDES + GAIN + j], rays[ABOVE + GAIN + j], rays[BELOW + GAIN + j]
-        d, e, f = rays[SIDES + GAIN + j + one], rays[ABOVE + GAIN + j + one], rays[BELOW + GAIN + j + one]
+        a, b, c, d = (
+            rays[ABOVE + GAIN + j],
+            rays[BELOW + GAIN + j],
+            rays[ABOVE + GAIN + j + one],
+            rays[BELOW + GAIN + j + one],
+        )
         p, q, r, u = (a if a < b else b), (c if c < d else d), (a if a > b else b), (c if c > d else d)
-        v, w = (e if e < f else f), (e if e > f else f)
-        p, r = (p if p < q else q), (r if r > u else u)
-        least, most = (p if p < v else v), (r if r > w else w)
+        least, most = (p if p < q else q), (r if r > u else u)
         rays[LITS + j] = WHOLE if least > ZERO else PARTLY if most > ZERO else ZERO
 
 
 @fused_part
-def bent(rays: Any, j: Any) -> Any:
+def bent(rays: Any, j: Any, is_known: Any, part: Any) -> Any:
     """What rays have of a pixel, as a quadratic in the place on it: `CX`, `AX`, `BX`, `AXX`, `BXX`, `ABX`. j: of the
-    lane, among x, y or gains."""
-    one = np.uint64(1)
-    c, a, b = rays[OWN + j], rays[SIDES + j], rays[SIDES + j + one]
-    d, e, f, g = rays[ABOVE + j], rays[ABOVE + j + one], rays[BELOW + j], rays[BELOW + j + one]
-    left, right = f - d, g - e
-    ax, bx, mixed = b - a, HALF * (left + right), right - left
-    axx = FOUR * (a + b - c - c)
-    bxx = ((d + f) - (a + a)) + ((e + g) - (b + b))
-    return c, ax, bx, axx, bxx + bxx, mixed
+    lane, among x, y or gains. is_known: whether both neighbours are lit: else `part` of the bend is along the row.
+    """
+    one, two, eight = np.uint64(1), np.float32(2), np.float32(8)
+    c, d, e, f, g = rays[OWN + j], rays[ABOVE + j], rays[ABOVE + j + one], rays[BELOW + j], rays[BELOW + j + one]
+    left, right, top, bottom = f - d, g - e, e - d, g - f
+    both = two * ((d + g) + (e + f)) - eight * c
+    along = (rays[OWN + j - one] - c) + (rays[OWN + j + one] - c)
+    along = along if is_known else part * both
+    return c, HALF * (top + bottom), HALF * (left + right), along, both - along, bottom - top
 
 
 @fused_part
@@ -181,20 +209,30 @@ def reach(ax: Any, bx: Any, axx: Any, bxx: Any, mixed: Any) -> Any:
 def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -> None:
     """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel.
 
-    bands: (4, 4), see `AREAS`.
+    bands: (4, 5), see `AREAS`.
     """
     dx, dy, end_x, end_y = shift[0], shift[1], last[0], last[1]
     area1, area2, area3 = bands[0, AREAS], bands[1, AREAS], bands[2, AREAS]
     aim0, aim1, aim2, aim3 = bands[0, AIMS], bands[1, AIMS], bands[2, AIMS], bands[3, AIMS]
     first0, first1, first2, first3 = bands[0, FIRSTS], bands[1, FIRSTS], bands[2, FIRSTS], bands[3, FIRSTS]
     part0, part1, part2, part3 = bands[0, PARTS], bands[1, PARTS], bands[2, PARTS], bands[3, PARTS]
-    small, two, twelfth = np.float32(1 / 24), np.float32(2), np.float32(1 / 12)
+    room0, room1, room2, room3 = bands[0, ROOMS], bands[1, ROOMS], bands[2, ROOMS], bands[3, ROOMS]
+    one, tiny, small, two, twelfth = (
+        np.uint64(1),
+        np.float32(1e-20),
+        np.float32(1 / 24),
+        np.float32(2),
+        np.float32(1 / 12),
+    )
     for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
-        g, ag, bg, agg, bgg, _ = bent(rays, GAIN + j)
+        before, after = rays[OWN + GAIN + j - one], rays[OWN + GAIN + j + one]
+        known = (before if before < after else after) > ZERO
+        g, ag, bg, agg, bgg, _ = bent(rays, GAIN + j, known, HALF)
+        steep = ag * ag / (ag * ag + bg * bg + tiny)  # light ends there, and across that line places change
         gain = g + (agg + bgg) * small
         rays[GAINS + j] = gain
         per = twelfth / gain  # what is brighter counts more: it is as if the middle lay there
-        cx, ax, bx, axx, bxx, mixed = bent(rays, j)
+        cx, ax, bx, axx, bxx, mixed = bent(rays, j, known, steep)
         cx += dx + (ag * ax + bg * bx) * per
         p, q = cx - reach(ax, bx, axx, bxx, mixed), end_x - cx - reach(ax, bx, axx, bxx, mixed)
         far = p if p < q else q
@@ -204,7 +242,7 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -
         rays[AXX + j] = axx
         rays[BXX + j] = bxx
         rays[ABX + j] = mixed
-        cy, ay, by, ayy, byy, mixed = bent(rays, Y_ + j)
+        cy, ay, by, ayy, byy, mixed = bent(rays, Y_ + j, known, steep)
         cy += dy + (ag * ay + bg * by) * per
         p, q = cy - reach(ay, by, ayy, byy, mixed), end_y - cy - reach(ay, by, ayy, byy, mixed)
         p = p if p < q else q
@@ -214,13 +252,18 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -
         rays[AYY + j] = ayy
         rays[BYY + j] = byy
         rays[ABY + j] = mixed
-        rays[FAR + j] = far if far < p else p
+        far = far if far < p else p
+        rays[FAR + j] = far
         area = abs(ax * by - ay * bx)
         aim, first, part = (aim0, first0, part0) if area < area1 else (aim1, first1, part1)
         aim, first, part = (aim, first, part) if area < area2 else (aim2, first2, part2)
         aim, first, part = (aim, first, part) if area < area3 else (aim3, first3, part3)
+        room = room0 if area < area1 else room1
+        room = room if area < area2 else room2
+        room = room if area < area3 else room3
+        rays[EIGHTS + j] = room if far >= ZERO else OTHER
         rays[PART + j] = area * part
-        rays[LITS + j] = rays[LITS + j] if area < LARGEST else PARTLY
+        rays[LITS + j] = rays[LITS + j] if area < (LARGEST if known else LARGEST_ALONE) else PARTLY
         ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))
         across = np.float32(math.sqrt(aim * np.float32(math.sqrt(ratio)))) + HALF
         across = across if across < HALF * aim else HALF * aim

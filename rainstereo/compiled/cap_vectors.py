@@ -49,7 +49,7 @@ def _gathered(builder: Any, words: Any, numbers: Any, first: Any) -> Any:
     return found
 
 
-def _folded(builder: Any, values: Any, add: Any, lanes: int) -> Any:
+def folded(builder: Any, values: Any, add: Any, lanes: int) -> Any:
     """The sum over a vector's lanes."""
     while lanes > 1:
         lanes //= 2
@@ -65,20 +65,22 @@ def _folded(builder: Any, values: Any, add: Any, lanes: int) -> Any:
 
 
 @intrinsic
-def _above_zero(_context: Any, rays: Any, plane: Any) -> Any:
-    """above_zero(rays, plane): which of a plane's 64 lanes are, as bits."""
+def _above(_context: Any, rays: Any, plane: Any, _limit: Any) -> Any:
+    """above(rays, plane, limit): which of a plane's 64 lanes are, as bits."""
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        data, first = _data(context, builder, signature, given)
+        data, first, limit = _data(context, builder, signature, given)
+        nothing = ir.Constant(REALS, ir.Undefined)
+        limits = builder.shuffle_vector(builder.insert_element(nothing, limit, FOUR(0)), nothing, _all(0))
         bits = LONG(0)
         for lane in range(0, ALL_LANES, WIDE):
             values = _load(builder, data, builder.add(first, LONG(lane)), REALS)
-            above = builder.fcmp_ordered(">", values, ir.Constant(REALS, [0.0] * WIDE))
+            above = builder.fcmp_ordered(">", values, limits)
             part = builder.zext(builder.bitcast(above, ir.IntType(WIDE)), LONG)
             bits = builder.or_(bits, builder.shl(part, LONG(lane)))
         return bits
 
-    return types.uint64(rays, types.uint64), code
+    return types.uint64(rays, types.uint64, types.float32), code
 
 
 @intrinsic
@@ -87,6 +89,16 @@ def _lowest(_context: Any, _bits: Any) -> Any:
 
     def code(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
         return builder.cttz(given[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.uint64(types.uint64), code
+
+
+@intrinsic
+def _highest(_context: Any, _bits: Any) -> Any:
+    """highest(bits): the number of the highest bit of some that are not 0."""
+
+    def code(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+        return builder.sub(LONG(63), builder.ctlz(given[0], ir.Constant(ir.IntType(1), 1)))
 
     return types.uint64(types.uint64), code
 
@@ -117,7 +129,7 @@ def _sum_of_16(_context: Any, rays: Any, _first: Any) -> Any:
         values = builder.fadd(
             _load(builder, data, first, REALS), _load(builder, data, builder.add(first, LONG(WIDE)), REALS)
         )
-        return _folded(builder, values, builder.fadd, WIDE)
+        return folded(builder, values, builder.fadd, WIDE)
 
     return types.float32(rays, types.uint64), code
 
@@ -139,7 +151,7 @@ def _weighed(_context: Any, words: Any, at: Any, _first: Any, rays: Any, _weight
             new = [builder.fmul(builder.sitofp(part, REALS), weight) for part in parts] + [weight]
             sums = [builder.fadd(old, one) for old, one in zip(sums, new, strict=True)] if sums else new
         return context.make_tuple(
-            builder, signature.return_type, [_folded(builder, part, builder.fadd, WIDE) for part in sums]
+            builder, signature.return_type, [folded(builder, part, builder.fadd, WIDE) for part in sums]
         )
 
     four: Any = vars(types)["UniTuple"](types.float32, 4)
@@ -147,14 +159,15 @@ def _weighed(_context: Any, words: Any, at: Any, _first: Any, rays: Any, _weight
 
 
 @intrinsic
-def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any) -> Any:
-    """sum_of_words(words, at, first, count): of up to 64 words, as if each had been spread (`boxes.spread`).
+def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any, _room: Any) -> Any:
+    """sum_of_words(words, at, first, count, room): of up to 64 words, as if each had been spread (`boxes.spread`).
 
-    at: their numbers, from `first` on, up to a multiple of 8 of which those after `count` are any words'.
+    at: their numbers, from `first` on, up to a number `room` of them, a multiple of 8; those after `count` are any
+    words'.
     """
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        texels, numbers, first, count = _data(context, builder, signature, given)
+        texels, numbers, first, count, room = _data(context, builder, signature, given)
         outer = FIELD | FIELD << 2 * BITS
         before, loop, after = builder.block, builder.append_basic_block("eight"), builder.append_basic_block("sum")
         limit = builder.insert_element(ir.Constant(WORDS, ir.Undefined), builder.trunc(count, FOUR), FOUR(0))
@@ -168,27 +181,40 @@ def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any) 
         parts = builder.and_(found, _all(outer)), builder.and_(builder.lshr(found, _all(BITS)), _all(FIELD))
         added = [builder.add(old, one) for old, one in zip(sums, parts, strict=True)]
         further, next_lanes = builder.add(done, LONG(WIDE)), builder.add(lanes, _all(WIDE))
-        builder.cbranch(builder.icmp_unsigned("<", further, count), loop, after)
+        builder.cbranch(builder.icmp_unsigned("<", further, room), loop, after)
         starts = LONG(0), ir.Constant(WORDS, list(range(WIDE))), _all(0), _all(0)
         for phi, start, new in zip((done, lanes, *sums), starts, (further, next_lanes, *added), strict=True):
             phi.add_incoming(start, before)
             phi.add_incoming(new, loop)
         builder.position_at_end(after)  # the last channel may have 12 bits: its sum is not folded beside the first's
         first_middle = builder.or_(builder.and_(added[0], _all((1 << 16) - 1)), builder.shl(added[1], _all(16)))
-        last = builder.zext(_folded(builder, builder.lshr(added[0], _all(2 * BITS)), builder.add, WIDE), LONG)
-        both = builder.zext(_folded(builder, first_middle, builder.add, WIDE), LONG)
+        last = builder.zext(folded(builder, builder.lshr(added[0], _all(2 * BITS)), builder.add, WIDE), LONG)
+        both = builder.zext(folded(builder, first_middle, builder.add, WIDE), LONG)
         low, middle = builder.and_(both, LONG((1 << 16) - 1)), builder.lshr(both, LONG(16))
         return builder.or_(low, builder.or_(builder.shl(last, LONG(20)), builder.shl(middle, LONG(40))))
 
-    return types.uint64(words, at, types.uint64, types.uint64), code
+    return types.uint64(words, at, types.uint64, types.uint64, types.uint64), code
 
 
-above_zero: Any = _above_zero
+above: Any = _above
 lowest: Any = _lowest
+highest: Any = _highest
 thrice: Any = _thrice
 sum_of_16: Any = _sum_of_16
 weighed: Any = _weighed
 sum_of_words: Any = _sum_of_words
+
+
+@fused_part
+def above_zero(rays: Any, plane: Any) -> Any:
+    """Which of a plane's 64 lanes are above 0, as bits."""
+    return above(rays, plane, np.float32(0))
+
+
+@fused_part
+def ends(marked: Any) -> Any:
+    """Of the lanes that are marked, the first and that after the last; 0, 0 if there is none."""
+    return (np.int64(lowest(marked)), np.int64(highest(marked)) + 1) if marked else (0, 0)
 
 
 @fused_part

@@ -11,8 +11,9 @@ import numba
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 SETTINGS: dict[str, Any] = {"nogil": True, "boundscheck": False, "error_model": "numpy"}
-FUSED: dict[str, Any] = {**SETTINGS, "fastmath": {"contract"}}
-"""Products and what they are added to are rounded once, not twice, where the processor can."""
+FUSED: dict[str, Any] = {**SETTINGS, "fastmath": {"contract"}, "_nrt": False}
+"""Products and what they are added to are rounded once, not twice, where the processor can. And nobody counts who uses
+an array, which takes longer than what is done with a row of one: such loops make no arrays, but are given them."""
 
 
 def inlined(loop: Loop) -> Loop:

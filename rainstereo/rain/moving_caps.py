@@ -33,7 +33,7 @@ from .outlines import Outlines
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE = (20.0, 8), (24.0, 12), (64.0, 24), (math.inf, 36)
+FINE = (20.0, 8), (24.0, 12), (64.0, 24), (math.inf, 40)
 COARSE = (16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)
 """Square root of the area, pixels, up to which what a pixel shows gets how many looks, the first of them at four boxes
 each."""
@@ -136,11 +136,14 @@ class CapScene:
     @cached_property
     def looks(self) -> tuple[Any, ...]:
         """Grids of looks and what says which a patch gets, see `compiled.cap_frames.frame`."""
+        from rainstereo.compiled.cap_tiles import OTHER
+
         grids: list[Array] = []
         counts: list[int] = []
-        bands: list[tuple[float, int, int, float]] = []
+        bands: list[tuple[float, int, int, float, int]] = []
         for (side, aim), wider in zip(self.fineness, WIDER, strict=True):
-            bands.append((min(side * side, FAR), aim, len(counts) - 2, wider / aim))
+            eights = -(-aim // 8) if bands else int(OTHER)
+            bands.append((min(side * side, FAR), aim, len(counts) - 2, wider / aim, eights))
             for across in range(2, aim // 2 + 1):
                 down = max(aim // across, 2)
                 s, t = (part.ravel() for part in np.meshgrid(_middles(across), _middles(down)))
@@ -152,14 +155,15 @@ class CapScene:
 
     def go(self, mode: int, out: Any, scene: Any, words: Any, caps: CapTable, record: Any) -> None:
         """Run the loops over caps, see `compiled.cap_frames.frame`."""
-        from rainstereo.compiled.cap_frames import frame
+        from rainstereo.compiled.cap_frames import desk, frame
 
         lattice, boxes = self.lattice, self.boxes
         border = 0 if self.border == "mirror" else 1
         shift = np.float32(self.shift[0]), np.float32(self.shift[1])
+        flat, sizes = out.reshape(-1), (boxes.start, boxes.width, boxes.inverse)
         frame(
-            mode, out, scene, words, (boxes.start, boxes.width, boxes.inverse), border, shift, self.looks,
-            caps.nodes, caps.columns, caps.outlines, caps.rivals, lattice.later, lattice.view, record,
+            mode, flat, self.camera.size, scene, words, sizes, border, shift, self.looks, caps.nodes, caps.columns,
+            caps.outlines, caps.rivals, lattice.later, lattice.view, record, desk(),
         )  # fmt: skip
 
 

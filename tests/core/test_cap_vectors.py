@@ -23,7 +23,9 @@ def test_sums_are_those_of_channels():
 
     @fused_part
     def of_words(words, at, first, count):
-        return channels_of(cap_vectors.sum_of_words(words, at, first, count))
+        return channels_of(
+            cap_vectors.sum_of_words(words, at, first, count, (count + np.uint64(7)) // np.uint64(8) * np.uint64(8))
+        )
 
     @fused_part
     def of_weights(words, at, first, rays, weights):
@@ -99,3 +101,56 @@ def test_outlines_enclose_drops_whose_images_are_bent(normal, coefficients):
         if found.radius[i] > 0:
             farthest = np.hypot(pixels[:, 0] - found.x[i], pixels[:, 1] - found.y[i]).max()
             assert farthest + 0.95 * MARGIN < found.radius[i] < 1.03 * farthest + MARGIN
+
+
+@needs_numba
+def test_lanes_compute_what_numpy_does():
+    from rainstereo.compiled import cap_lanes
+    from rainstereo.compiled.compile import fused_part
+
+    @fused_part
+    def side(numbers):
+        a, b = numbers[:6], numbers[6:]
+        return cap_lanes.side_sum(a[0], a[1], a[2], a[3], a[4], a[5], b[0], b[1], b[2], b[3], b[4], b[5])
+
+    rng = np.random.default_rng(3)
+    along = (np.arange(4) + 0.5) / 4 - 0.5
+    s, t = (part.ravel() for part in np.meshgrid(along, along))
+    partly = 0
+    for _ in range(200):
+        phi, radius, away = rng.uniform((0, 0.5, 0.95), (2 * math.pi, 2, 1.1))
+        px, py = (away * radius * part for part in (math.cos(phi), math.sin(phi)))
+        kx, ky = rng.uniform(-0.6, 0.6, 2)
+        kz, depth, per = math.sqrt(1 - kx * kx - ky * ky), rng.uniform(-1, 1), rng.uniform(5, 40)
+        xu, xv, yu, yv = rng.uniform(-0.1, 0.1, 4)
+        x, y = px + s * xu + t * xv, py + s * yu + t * yv
+        b = x * kx + y * ky + kz * depth  # what a ray has to go yet to where it is closest to the sphere's centre
+        closest = np.hypot(b * kx - x, b * ky - y)
+        side_away = 0.5 * (b * b + radius**2 - x * x - y * y) / closest
+        away = radius - np.hypot(x, y)
+        away = np.where((b < 0) & (side_away > away), side_away, away)
+        expected = np.clip(0.5 + away * per, 0, 1).sum()
+        partly += 0 < expected < 16
+        found = side(np.array([px, py, kx, ky, kz, radius, depth, xu, xv, yu, yv, per], np.float32))
+        assert found == pytest.approx(expected, abs=2e-3)
+    assert partly > 50
+
+
+@needs_numba
+def test_spans_are_of_the_lanes_that_are_marked():
+    from rainstereo.compiled import cap_vectors
+    from rainstereo.compiled.compile import fused_part
+
+    @fused_part
+    def span(rays, limit):
+        return cap_vectors.ends(cap_vectors.above(rays, np.uint64(64), limit))
+
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        rays = rng.normal(size=192).astype(np.float32)
+        limit = np.float32(rng.uniform(0, 4))
+        marked = np.flatnonzero(rays[64:128] > limit)
+        expected = (marked[0], marked[-1] + 1) if len(marked) else (0, 0)
+        assert span(rays, limit) == expected
+    assert span(np.full(192, np.nan, np.float32), np.float32(-1)) == (0, 0)
+    assert span(np.ones(192, np.float32), np.float32(0)) == (0, 64)
