@@ -13,7 +13,8 @@ from typing import Any
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from .cap_vectors import LONG, REALS, WIDE, folded, ir
+from .cap_vectors import REALS, WIDE, folded
+from .llvm import LONG, arguments, ir, load, spread, store
 
 SIDE = 4  # samples along a pixel's side where a cap hangs over
 declared: Any = vars(cgutils)["get_or_insert_function"]
@@ -32,20 +33,16 @@ class Lanes:
     @classmethod
     def of(cls, builder: Any, number: Any) -> Lanes:
         """One number in all lanes."""
-        nothing, four = ir.Constant(REALS, ir.Undefined), ir.IntType(32)
-        value = builder.insert_element(nothing, number, four(0))
-        return cls(builder, builder.shuffle_vector(value, nothing, ir.Constant(ir.VectorType(four, WIDE), [0] * WIDE)))
+        return cls(builder, spread(builder, number, REALS))
 
     @classmethod
     def at(cls, builder: Any, data: Any, place: Any) -> Lanes:
         """Those that stand side by side in memory."""
-        where = builder.bitcast(builder.gep(data, [place]), REALS.as_pointer())
-        return cls(builder, builder.load(where, align=4))
+        return cls(builder, load(builder, data, place, REALS))
 
     def put(self, data: Any, place: Any) -> None:
         """Write them there."""
-        where = self.builder.bitcast(self.builder.gep(data, [place]), REALS.as_pointer())
-        self.builder.store(self.value, where, align=4)
+        store(self.builder, self.value, data, place)
 
     def _value(self, other: Number) -> Any:
         return other.value if isinstance(other, Lanes) else ir.Constant(REALS, [float(other)] * WIDE)
@@ -92,8 +89,7 @@ def _loop(signature: Callable[[Any], Any], body: Callable[..., None]) -> Any:
     """A loop over lanes from `first` to before `last`, whole vectors, as a function (rays, first, last, to, ...)."""
 
     def code(context: Any, builder: Any, found: Any, given: Any) -> Any:
-        data = context.make_array(found.args[0])(context, builder, given[0]).data
-        first, last, to, *numbers = given[1:]
+        data, first, last, to, *numbers = arguments(context, builder, found, given)
         every = [Lanes.of(builder, number) for number in numbers]
         with cgutils.for_range_slice(builder, first, last, LONG(WIDE), LONG) as (lane, _):
 

@@ -8,35 +8,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba.core import cgutils, types
+from numba.core import types
 from numba.extending import intrinsic
 
 from .boxes import BITS
 from .compile import fused_part
+from .llvm import FOUR, LONG, REAL, alike, arguments, ir, load, spread, store
 
-ir: Any = vars(cgutils)["ir"]  # of llvmlite, which numba brings along
 WIDE = 8
-FOUR, LONG, REAL = ir.IntType(32), ir.IntType(64), ir.FloatType()
 WORDS, REALS = ir.VectorType(FOUR, WIDE), ir.VectorType(REAL, WIDE)
 FIELD = (1 << BITS) - 1
 ALL_LANES = 64
 
 
-def _data(context: Any, builder: Any, signature: Any, given: Any) -> list[Any]:
-    """Arguments, arrays as where their elements begin."""
-    return [
-        context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
-        for kind, value in zip(signature.args, given, strict=True)
-    ]
-
-
-def _load(builder: Any, data: Any, at: Any, kind: Any) -> Any:
-    place = builder.bitcast(builder.gep(data, [at]), kind.as_pointer())
-    return builder.load(place, align=4)
-
-
-def _all(value: int) -> Any:
-    return ir.Constant(WORDS, [value] * WIDE)
+def _words(value: int) -> Any:
+    return alike(WORDS, value)
 
 
 def _gathered(builder: Any, words: Any, numbers: Any, first: Any) -> Any:
@@ -69,12 +55,11 @@ def _above(_context: Any, rays: Any, plane: Any, _limit: Any) -> Any:
     """above(rays, plane, limit): which of a plane's 64 lanes are, as bits."""
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        data, first, limit = _data(context, builder, signature, given)
-        nothing = ir.Constant(REALS, ir.Undefined)
-        limits = builder.shuffle_vector(builder.insert_element(nothing, limit, FOUR(0)), nothing, _all(0))
+        data, first, limit = arguments(context, builder, signature, given)
+        limits = spread(builder, limit, REALS)
         bits = LONG(0)
         for lane in range(0, ALL_LANES, WIDE):
-            values = _load(builder, data, builder.add(first, LONG(lane)), REALS)
+            values = load(builder, data, builder.add(first, LONG(lane)), REALS)
             above = builder.fcmp_ordered(">", values, limits)
             part = builder.zext(builder.bitcast(above, ir.IntType(WIDE)), LONG)
             bits = builder.or_(bits, builder.shl(part, LONG(lane)))
@@ -108,13 +93,12 @@ def _thrice(_context: Any, rays: Any, _source: Any, _to: Any) -> Any:
     """thrice(rays, source, to): write each of 8 numbers three times, side by side, `to` on."""
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        data, source, to = _data(context, builder, signature, given)
-        values = _load(builder, data, source, REALS)
+        data, source, to = arguments(context, builder, signature, given)
+        values = load(builder, data, source, REALS)
         nothing = ir.Constant(REALS, ir.Undefined)
         for part in range(3):
             which = ir.Constant(WORDS, [(WIDE * part + lane) // 3 for lane in range(WIDE)])
-            place = builder.bitcast(builder.gep(data, [builder.add(to, LONG(WIDE * part))]), REALS.as_pointer())
-            builder.store(builder.shuffle_vector(values, nothing, which), place, align=4)
+            store(builder, builder.shuffle_vector(values, nothing, which), data, builder.add(to, LONG(WIDE * part)))
         return context.get_dummy_value()
 
     return types.void(rays, types.uint64, types.uint64), code
@@ -125,9 +109,9 @@ def _sum_of_16(_context: Any, rays: Any, _first: Any) -> Any:
     """sum_of_16(rays, first): of sixteen numbers."""
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        data, first = _data(context, builder, signature, given)
+        data, first = arguments(context, builder, signature, given)
         values = builder.fadd(
-            _load(builder, data, first, REALS), _load(builder, data, builder.add(first, LONG(WIDE)), REALS)
+            load(builder, data, first, REALS), load(builder, data, builder.add(first, LONG(WIDE)), REALS)
         )
         return folded(builder, values, builder.fadd, WIDE)
 
@@ -142,12 +126,12 @@ def _weighed(_context: Any, words: Any, at: Any, _first: Any, rays: Any, _weight
     """
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        texels, numbers, first, data, weights = _data(context, builder, signature, given)
+        texels, numbers, first, data, weights = arguments(context, builder, signature, given)
         sums: list[Any] = []
         for half in (0, WIDE):
             found = _gathered(builder, texels, numbers, builder.add(first, LONG(half)))
-            weight = _load(builder, data, builder.add(weights, LONG(half)), REALS)
-            parts = [builder.and_(builder.lshr(found, _all(BITS * channel)), _all(FIELD)) for channel in range(3)]
+            weight = load(builder, data, builder.add(weights, LONG(half)), REALS)
+            parts = [builder.and_(builder.lshr(found, _words(BITS * channel)), _words(FIELD)) for channel in range(3)]
             new = [builder.fmul(builder.sitofp(part, REALS), weight) for part in parts] + [weight]
             sums = [builder.fadd(old, one) for old, one in zip(sums, new, strict=True)] if sums else new
         return context.make_tuple(
@@ -167,28 +151,30 @@ def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any, 
     """
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        texels, numbers, first, count, room = _data(context, builder, signature, given)
+        texels, numbers, first, count, room = arguments(context, builder, signature, given)
         outer = FIELD | FIELD << 2 * BITS
         before, loop, after = builder.block, builder.append_basic_block("eight"), builder.append_basic_block("sum")
-        limit = builder.insert_element(ir.Constant(WORDS, ir.Undefined), builder.trunc(count, FOUR), FOUR(0))
-        limit = builder.shuffle_vector(limit, ir.Constant(WORDS, ir.Undefined), _all(0))
+        limit = spread(builder, builder.trunc(count, FOUR), WORDS)
         builder.branch(loop)
         builder.position_at_end(loop)
         done, lanes = builder.phi(LONG), builder.phi(WORDS)
         sums = [builder.phi(WORDS) for _ in range(2)]
         found = _gathered(builder, texels, numbers, builder.add(first, done))
-        found = builder.select(builder.icmp_unsigned("<", lanes, limit), found, _all(0))
-        parts = builder.and_(found, _all(outer)), builder.and_(builder.lshr(found, _all(BITS)), _all(FIELD))
+        found = builder.select(builder.icmp_unsigned("<", lanes, limit), found, _words(0))
+        parts = (
+            builder.and_(found, _words(outer)),
+            builder.and_(builder.lshr(found, _words(BITS)), _words(FIELD)),
+        )
         added = [builder.add(old, one) for old, one in zip(sums, parts, strict=True)]
-        further, next_lanes = builder.add(done, LONG(WIDE)), builder.add(lanes, _all(WIDE))
+        further, next_lanes = builder.add(done, LONG(WIDE)), builder.add(lanes, _words(WIDE))
         builder.cbranch(builder.icmp_unsigned("<", further, room), loop, after)
-        starts = LONG(0), ir.Constant(WORDS, list(range(WIDE))), _all(0), _all(0)
+        starts = LONG(0), ir.Constant(WORDS, list(range(WIDE))), _words(0), _words(0)
         for phi, start, new in zip((done, lanes, *sums), starts, (further, next_lanes, *added), strict=True):
             phi.add_incoming(start, before)
             phi.add_incoming(new, loop)
         builder.position_at_end(after)  # the last channel may have 12 bits: its sum is not folded beside the first's
-        first_middle = builder.or_(builder.and_(added[0], _all((1 << 16) - 1)), builder.shl(added[1], _all(16)))
-        last = builder.zext(folded(builder, builder.lshr(added[0], _all(2 * BITS)), builder.add, WIDE), LONG)
+        first_middle = builder.or_(builder.and_(added[0], _words((1 << 16) - 1)), builder.shl(added[1], _words(16)))
+        last = builder.zext(folded(builder, builder.lshr(added[0], _words(2 * BITS)), builder.add, WIDE), LONG)
         both = builder.zext(folded(builder, first_middle, builder.add, WIDE), LONG)
         low, middle = builder.and_(both, LONG((1 << 16) - 1)), builder.lshr(both, LONG(16))
         return builder.or_(low, builder.or_(builder.shl(last, LONG(20)), builder.shl(middle, LONG(40))))

@@ -44,16 +44,18 @@ def exchange(
             count -= U(1)
             taken[worst] = taken[count]
             if known > count:
-                own[worst, :there] = own[count, :there]
+                for i in range(there):
+                    own[worst, i] = own[count, i]
                 known = count
-            known = min(known, worst) if worst >= known else known
+            elif worst < known:
+                known = worst
             continue
         while known < count:
             widen(pairs, begin, shapes, side, atoms[taken[known]], rects, base, there, own[known])
             known += U(1)
         for i in range(there):
-            column = U(columns[i])
-            rest[i], news[i] = np.float64(along[column]), np.float64(variance[column])
+            texel = U(columns[i])
+            rest[i], news[i] = np.float64(along[texel]), np.float64(variance[texel])
         for k in range(count):
             combine(inverse[k], own, count, there, seen[k])
             lower(rest, news, own[k], seen[k], weight[k], there)
@@ -74,9 +76,9 @@ def exchange(
             taken[count] = U(columns[best])
             count += U(1)
         else:
-            k = U(which[best])
-            taken[k] = U(columns[best])
-            widen(pairs, begin, shapes, side, atoms[taken[k]], rects, base, there, own[k])
+            other = U(which[best])
+            taken[other] = U(columns[best])
+            widen(pairs, begin, shapes, side, atoms[taken[other]], rects, base, there, own[other])
     return count
 
 

@@ -41,20 +41,21 @@ def _of_pixel(
     gram: Image, along: Image, columns: Indices, price: Any, least: Any, taken: list[int], most: int
 ) -> list[int]:
     for _ in range(ROUNDS):
-        inverse = np.linalg.inv(gram[np.ix_(taken, taken)].astype(np.float64))
-        weight = inverse @ along[taken].astype(np.float64)
+        some = np.array(taken)
+        inverse = np.linalg.inv(gram[some[:, None], some].astype(np.float64))
+        weight = inverse @ along[some].astype(np.float64)
         lost = weight**2 / np.diag(inverse)
-        if len(taken) > 1 and (lost / price[taken]).min() < 1:
-            taken[int((lost / price[taken]).argmin())] = taken[-1]
+        if len(taken) > 1 and (lost / price[some]).min() < 1:
+            taken[int((lost / price[some]).argmin())] = taken[-1]
             taken.pop()
             continue
-        own = gram[np.ix_(taken, columns)].astype(np.float64)
+        own = gram[some[:, None], columns].astype(np.float64)
         seen = inverse @ own
         rest = along[columns] - weight @ own
         news = gram[columns, columns] - (own * seen).sum(0)
         away = seen / np.diag(inverse)[:, None]  # in common with what only that one tells
         worth = _worth(rest + weight[:, None] * away, news + seen * away, price, least, columns)
-        worth -= (lost - price[taken])[:, None]
+        worth -= (lost - price[some])[:, None]
         if len(taken) < most:
             worth = np.concatenate([worth, _worth(rest, news, price, least, columns)[None]])
         which, best = np.unravel_index(worth.argmax(), worth.shape)
