@@ -95,7 +95,7 @@ class Options:
     motion: MotionKind | None = None
     """Of drops in sequences and videos: physical (default), the paper's rule, or still."""
     quick: bool = False
-    """For sequences and videos whose sharp drops mostly move: traced for each frame, off by 2 gray levels or so with
+    """For sequences and videos whose sharp drops mostly move: traced for each frame, off by 1 gray level or so with
     numba (the extra `fast`), and by 4 without."""
     refill_s: float = 5.0
     """Seconds in which as many drops fall on a sequence's pane as are there at the start; inf: none fall."""

@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
+import numpy as np
 
 from .types import Array, Image
 
-DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
+DEPTHS = {np.dtype("uint8"): cv2.CV_8U, np.dtype("uint16"): cv2.CV_16U, np.dtype("float32"): cv2.CV_32F}
 STRIP = 32768  # samples pasted at a time: few enough for the caches
 
 
@@ -68,7 +69,7 @@ class Layer:
 
 def depth_of(image: Image) -> int:
     """OpenCV's number for the image's type; ValueError unless it is an image that layers work on."""
-    depth = DEPTHS.get(image.dtype.name)
+    depth = DEPTHS.get(image.dtype)
     if depth is None or image.ndim not in (2, 3) or (image.ndim == 3 and not 1 <= image.shape[2] <= 4):
         raise ValueError(
             f"the image is {image.dtype} {image.shape}; expected uint8, uint16 or float32, (height, width) or "

@@ -45,15 +45,13 @@ def channels_of(found: Any) -> Any:
 
 
 @compiled
-def pack(values: Any, words: Any) -> None:
-    """Words of bytes, (N, 1 or 3), as large as they are."""
-    if values.shape[1] == 1:
-        for i in range(np.uint64(len(words))):
-            words[i] = np.uint32(values[i, 0])
-        return
-    for i in range(np.uint64(len(words))):
-        one, two = np.uint32(values[i, np.uint64(1)]) << FIELD, np.uint32(values[i, np.uint64(2)]) << TWICE
-        words[i] = np.uint32(values[i, np.uint64(0)]) | one | two
+def widen(quads: Any) -> None:
+    """Make words of quads (`quads`) of up to three bytes, (N,), in place."""
+    one, two, three = np.uint32(0xFF), np.uint32(0xFF00), np.uint32(0xFF0000)
+    apart = FIELD - np.uint32(8)
+    for i in range(np.uint64(len(quads))):
+        quad = quads[i]
+        quads[i] = (quad & one) | ((quad & two) << apart) | ((quad & three) << (apart + apart))
 
 
 @compiled

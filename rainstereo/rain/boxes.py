@@ -62,10 +62,11 @@ class Boxes:
     def words(self, image: Image) -> Any:
         """All boxes of bytes, (H, W, 1 or 3), as (count,) uint32."""
         from rainstereo.compiled import boxes as loops
+        from rainstereo.compiled.quads import halve
 
-        small = half(image)
-        cells = np.empty(small.shape[:2], dtype=np.uint32)
-        loops.pack(small.reshape(cells.size, -1), cells.ravel())
+        cells: Any = np.empty([-(-n // 2) for n in image.shape[:2]], dtype=np.uint32)
+        halve(image, True, cells.ravel())
+        loops.widen(cells.ravel())
         found = np.empty(self.count, dtype=np.uint32)
         loops.first_boxes(cells, self.part(found, 0))
         for k, apart, step in self.octaves:

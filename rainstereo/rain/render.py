@@ -28,6 +28,7 @@ from . import drop_list, linear_light
 from .blurred import BlurredLayer, by_disc, nearest
 from .cap_tier import OWN, CapTiers, DropTier
 from .drops import Drops
+from .far_caps import are_far_caps
 from .looks import Looks
 from .lookups import Lookups
 from .minified import Batch, Minifier
@@ -269,7 +270,9 @@ class Renderer:
     def scene_size(self) -> tuple[int, int]:
         """(width, height) of the images that are given: the camera's, and the surround."""
         width, height = self.camera.size
-        around = self.border if isinstance(self.border, Surround) else Surround()
+        if not isinstance(self.border, Surround):
+            return width, height
+        around = self.border
         return width + around.left + around.right, height + around.top + around.bottom
 
     def framed(self, image: Image) -> Image:
@@ -410,9 +413,7 @@ def _by_far_face(groups: Sequence[Group]) -> dict[int | None, list[int]]:
     """Numbers of groups of nothing but caps on one panel's far face, by the panel; None: the others."""
     found: dict[int | None, list[int]] = {}
     for i, group in enumerate(groups):
-        places = {(drop.panel, drop.face) if isinstance(drop, SphericalCap) else None for drop in group.drops}
-        place = places.pop() if len(places) == 1 else None
-        found.setdefault(place[0] if place is not None and place[1] == "far" else None, []).append(i)
+        found.setdefault(group.drops[0].panel if are_far_caps(group.drops) else None, []).append(i)
     return found
 
 
