@@ -262,87 +262,23 @@ def _others(
                     rays[SHOWN + j + j + j + channel] = gain * total[channel]
                 continue
             size, number, first = np.uint64(k), np.uint64(grid), np.uint64(64 * made)
-            start, pitch, one, count, of_grid = (
-                starts[size],
-                pitches[size],
-                inverses[size],
-                counts[number],
-                number * OF_GRID,
-            )
+            start, pitch, one = starts[size], pitches[size], inverses[size]
+            count, of_grid = counts[number], number * OF_GRID
+            full = (count + 7) // 8 * 8
             on = border if not rays[FAR + j] >= ZERO else INSIDE
             if grid < fines:
                 if on == INSIDE:
-                    places(
-                        True,
-                        start,
-                        pitch,
-                        one,
-                        last,
-                        INSIDE,
-                        rays,
-                        j,
-                        grids,
-                        of_grid,
-                        (count + 7) // 8 * 8,
-                        at,
-                        first,
-                        parts,
-                    )
+                    places(True, start, pitch, one, last, INSIDE, rays, j, grids, of_grid, full, at, first, parts)
                 else:
-                    places(
-                        True,
-                        start,
-                        pitch,
-                        one,
-                        last,
-                        on,
-                        rays,
-                        j,
-                        grids,
-                        of_grid,
-                        (count + 7) // 8 * 8,
-                        at,
-                        first,
-                        parts,
-                    )
+                    places(True, start, pitch, one, last, on, rays, j, grids, of_grid, full, at, first, parts)
                 for look in range(first, first + np.uint64(count)):
                     to_read(words, np.uint64(at[look]))
                     to_read(words, np.uint64(at[look]) + np.uint64(pitch))
             else:
                 if on == INSIDE:
-                    places(
-                        False,
-                        start,
-                        pitch,
-                        one,
-                        last,
-                        INSIDE,
-                        rays,
-                        j,
-                        grids,
-                        of_grid,
-                        (count + 7) // 8 * 8,
-                        at,
-                        first,
-                        parts,
-                    )
+                    places(False, start, pitch, one, last, INSIDE, rays, j, grids, of_grid, full, at, first, parts)
                 else:
-                    places(
-                        False,
-                        start,
-                        pitch,
-                        one,
-                        last,
-                        on,
-                        rays,
-                        j,
-                        grids,
-                        of_grid,
-                        (count + 7) // 8 * 8,
-                        at,
-                        first,
-                        parts,
-                    )
+                    places(False, start, pitch, one, last, on, rays, j, grids, of_grid, full, at, first, parts)
                 for look in range(first, first + np.uint64(count)):
                     to_read(words, np.uint64(at[look]))
             slots[np.uint64(0), np.uint64(made)], slots[ONE_, np.uint64(made)] = np.int64(j), count

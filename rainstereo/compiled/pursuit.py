@@ -106,10 +106,8 @@ def choose(
         for number in range(count):
             i = taken[number]
             shape = U(atoms[i, U(0)])
-            right, below = (
-                (column >> shapes[shape, U(0)]) + atoms[i, U(1)],
-                (row >> shapes[shape, U(1)]) + atoms[i, U(2)],
-            )
+            right = (column >> shapes[shape, U(0)]) + atoms[i, U(1)]
+            below = (row >> shapes[shape, U(1)]) + atoms[i, U(2)]
             texel[pixel, number] = shapes[shape, U(4)] + below * shapes[shape, U(2)] + right
 
 

@@ -122,11 +122,8 @@ def average(quads: Any, target: Any, copies: Any) -> None:
                     a = above + j + j
                     target[made + j] = mean_of_two(quads[a], quads[a + U(1)], of_two)
             else:
-                one, other, line = (
-                    quads[above : above + width],
-                    quads[below : below + width],
-                    target[made : made + pairs],
-                )
+                one, other = quads[above : above + width], quads[below : below + width]
+                line = target[made : made + pairs]
                 for j in range(pairs):
                     line[j] = mean_of_two(one[j], other[j], of_two)
             made += pairs
