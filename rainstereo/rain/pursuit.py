@@ -28,6 +28,7 @@ from rainstereo.patch import folded_along
 from rainstereo.scene_statistics import SceneStatistics
 from rainstereo.types import Array, Image, Indices, Mask
 
+from .best_weights import NEGATIVE, RIDGE, RIDGE_GROWS, gentle_weights
 from .exchange import GAIN, ROUNDS, exchanged
 from .pyramid import LONG, Copy, copies, copy_starts, sizes
 from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, whole
@@ -45,9 +46,6 @@ SMALL = 9.0
 """Pixels that rays must span: up to there their own four texels each are few enough, and exact."""
 SHRUNK = 4
 """Times that the photographs are shrunk whose statistics are taken: sharp images have more of what is fine."""
-NEGATIVE = 0.45
-"""What weights below 0 may add up to: sums of bytes have room for it, and a spot of light leaves no dark rings."""
-RIDGE, RIDGE_GROWS = 0.5, 2.0  # square gray levels that a square sum of weights of 1 costs where they add up to more
 FRESH = 1e-4  # part of a texel's variance that must be news after those taken before
 SCREENED, OFFERED = 12, 256
 """After so many texels of a pixel only so many others, those worth most then, are offered to it."""
@@ -188,7 +186,7 @@ class Pursuit:
         price, least = self._prices(level), np.float32(FRESH) * np.diag(words.gram)
         taken, counts = _taken(words, along, offered, price)
         taken, counts = exchanged(words.gram, along, offered, price, least, taken, counts)
-        weight = _gentle(words, along, taken, counts, share.sum(1, dtype=np.float64))
+        weight = gentle_weights(words.gram, along, taken, counts, share.sum(1, dtype=np.float64))
         texel = np.take_along_axis(numbers, taken, 1)
         return _Chosen(texel, weight, counts)
 
@@ -424,29 +422,3 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple
         news[news <= least] = np.inf
         rest[~good] = 0
     return taken, counts
-
-
-def _weights(
-    words: _Dictionary, along: Array, taken: Indices, counts: Indices, total: Array, ridge: float = 0.0
-) -> Array:
-    """The best weights, (M, MOST), of those that add up to `total`, (M,); ridge: what their square sum costs."""
-    found: Array = np.zeros(taken.shape)
-    for count in np.unique(counts[counts > 0]).tolist():
-        rows = np.flatnonzero(counts == count)
-        some = taken[rows, :count]
-        gram = words.gram[some[:, :, None], some[:, None]] + ridge * np.eye(count)
-        given = np.stack([np.take_along_axis(along[rows], some, 1), np.ones(some.shape)], -1)
-        free, even = np.moveaxis(np.linalg.solve(gram, given), -1, 0)
-        found[rows, :count] = free + even * ((total[rows] - free.sum(1)) / even.sum(1))[:, None]
-    return found
-
-
-def _gentle(words: _Dictionary, along: Array, taken: Indices, counts: Indices, total: Array) -> Array:
-    """The same, drawn towards even ones where those below 0 add up to too much."""
-    weight, ridge = _weights(words, along, taken, counts, total), RIDGE
-    while True:
-        rows = np.flatnonzero(np.minimum(weight, 0).sum(1) < -NEGATIVE)
-        if not rows.size:
-            return weight
-        weight[rows] = _weights(words, along[rows], taken[rows], counts[rows], total[rows], ridge)
-        ridge *= RIDGE_GROWS
