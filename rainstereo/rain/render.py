@@ -93,7 +93,7 @@ class Renderer:
     with lenses that only mrcal knows, and for other shapes, drops are planned with a few looks a pixel (`single_ray`):
     in some four times as long, and off by 4. Drops under gravity are drawn as caps of their volume where the bound of
     what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).
-    lasting: whether a plan serves hundreds of frames: planned in three times the time (ten times that without numba),
+    lasting: whether a plan serves hundreds of frames: planned in five times the time (ten times that without numba),
     of a quarter of the texels (`pursuit`), and with finer rays at outlines, so that drops are within the tolerance of
     1024 rays a pixel, of which 64 are off by nearly as much. 16-bit and floating point frames may then show values a
     little beyond the image's. With numba any plan of drops at rest is made by up to four threads, if OpenCV may use as
