@@ -14,3 +14,4 @@ DRAW, COUNT, FILL = 0, 1, 2
 LANES = 8  # pixels whose taps are summed together
 SHORT_BITS, LONG_BITS = 20, 32  # of a place, the lowest, where a tap has 32 bits, and where it has 64
 PLACE = 10  # bits of a texel's place in a window (`rain.windows`)
+MOST_RAYS = 1024  # of a pixel, that `ray_steps` has room for

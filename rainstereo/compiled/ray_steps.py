@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from .compile import compiled, inlined
+from .layout import MOST_RAYS
 
 U = np.uint64
 LANES = 8  # pixels at a time: side by side in memory
-MOST = 1024  # rays of a pixel
-PLANE = LANES * (MOST + 72)  # so that planes do not compete for the same lines of a cache
+PLANE = LANES * (MOST_RAYS + 72)  # so that planes do not compete for the same lines of a cache
 X, Y, DARK, LENGTH, FIRST, LAST = (U(PLANE * i) for i in range(6))
 OUT = U(PLANE * 6)  # and three more
 ZERO, ONE, INFINITE = np.float32(0), np.float32(1), np.float32(np.inf)
@@ -25,8 +25,8 @@ def brought_in(
 ) -> None:  # fmt: skip
     """Write places, and steps in x and y to the next ray right and below, found: (6, K, M) float32; and spans, (M,).
 
-    x, y, weights: (K, M) float32. last_x, last_y: of the image. jump: 1 / `rain.quadtree.JUMP`. is_loose: (M,) bool,
-    see `Quadtree.is_loose`, with `LOOSE`.
+    x, y, weights: (K, M) float32, K at most `MOST_RAYS`. last_x, last_y: of the image. jump: 1 / `rain.quadtree.JUMP`.
+    is_loose: (M,) bool, see `Quadtree.is_loose`, with `LOOSE`.
     """
     side = math.floor(math.sqrt(len(x)) + 0.5)
     room = np.zeros(10 * PLANE, np.float32)

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from rainstereo import compiled
+from rainstereo.compiled.layout import MOST_RAYS
 from rainstereo.patch import folded_along, turned_along
 from rainstereo.types import Array, Image, Indices, Mask
 
@@ -90,7 +91,7 @@ class Quadtree:
 
     def placed(self, x: Array, y: Array, weights: Array) -> tuple[Array, Array, Steps, Array, Mask]:
         """`brought_in`, `span_of` and `is_loose` of rays, (K, M) float32."""
-        if not compiled.available():
+        if not compiled.available() or len(weights) > MOST_RAYS:
             x, y, steps = brought_in(x, y, weights, self.size, self.border)
             span = span_of(x, y, weights)
             return x, y, steps, span, self.is_loose(span, steps, weights)

@@ -211,3 +211,20 @@ def test_copies_are_neither_lighter_nor_darker():
     flat = np.full((64, 64, 3), 77, dtype=np.uint8)
     for up in (False, True):
         assert (half(flat, up) == 77).all()
+
+
+def test_many_rays_of_a_pixel(monkeypatch):
+    """More than the loop has room for, and as many: the same texels as without it."""
+    for side in (32, 33, 40):
+        along = (np.arange(side) + 0.5) / side - 0.5
+        a, b = (part.reshape(-1, 1) for part in np.meshgrid(along, along))
+        centre = np.random.default_rng(side).uniform(80, 200, (2, 3))
+        x, y = centre[0] + 40 * a + 3 * b, centre[1] - 2 * a + 30 * b
+        x, y = (at.astype(np.float32) for at in (x, y))
+        weights: np.ndarray = np.full(x.shape, 1 / side**2, dtype=np.float32)
+        ours = Quadtree((400, 300), 17, 0.003).taps(x, y, weights)
+        with monkeypatch.context() as patch:
+            patch.setattr(compiled, "available", lambda: False)
+            plain = Quadtree((400, 300), 17, 0.003).taps(x, y, weights)
+        np.testing.assert_array_equal(ours.texels, plain.texels)
+        np.testing.assert_array_equal(ours.weights, plain.weights)
