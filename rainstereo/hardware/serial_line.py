@@ -19,7 +19,7 @@ class PumpError(RuntimeError):
 
 
 class PortError(PumpError):
-    """The serial port cannot be opened, belongs to another program, or has vanished."""
+    """The serial port cannot be opened, belongs to another program, takes no more data, or has vanished."""
 
 
 class Line(Protocol):
@@ -50,6 +50,7 @@ class SerialLine:
         except ImportError as error:  # pragma: no cover
             raise PumpError("the pump needs pyserial, which is not installed. Get it: pip install pyserial") from error
         self.port = port
+        self._too_late: type[OSError] = serial.SerialTimeoutException
         self._log: Any = None
         url = port
         if spy is not None:
@@ -71,6 +72,9 @@ class SerialLine:
         """Send all of it, within a second."""
         try:
             self._serial.write(data)
+        except self._too_late as error:
+            words = "took no data for a second: the device hangs, or this program was stopped"
+            raise PortError(f"{self.port}: the pump's port {words} ({error})") from error
         except (OSError, TypeError, AttributeError) as error:  # the latter two: closed meanwhile
             raise PortError(f"{self.port}: the pump's port vanished while writing ({error})") from error
 

@@ -1,6 +1,7 @@
 """The port: one opener, clear errors, a log of bytes, and what a bad cable and a vanished device do in real time."""
 
 import contextlib
+import os
 import time
 from pathlib import Path
 
@@ -57,6 +58,16 @@ def test_reading_from_a_dead_port(device: SimulatedPump) -> None:
     line.close()
     with pytest.raises(PortError):
         line.write(b"x")
+
+
+def test_a_port_that_takes_nothing_is_said_clearly() -> None:
+    near, far = os.openpty()
+    line = SerialLine(os.ttyname(far))
+    with pytest.raises(PortError, match="took no data for a second: the device hangs, or this program was stopped"):
+        line.write(bytes(1 << 20))  # nobody reads it
+    line.close()
+    for end in (near, far):
+        os.close(end)
 
 
 def test_it_reconnects_and_does_not_resume(tmp_path: Path) -> None:
