@@ -150,11 +150,11 @@ def test_groups_of_a_plan_in_windows(monkeypatch):
 @pytest.mark.parametrize("lasting", [False, True])
 def test_loops_compiled_ahead_are_those_that_draw(lasting, monkeypatch):
     """A plan that comes after has nothing left to compile."""
-    from rainstereo.compiled import far_face, merged_cells, orders, pursuit, quads, ray_steps, sums, windows
+    from rainstereo.compiled import cells, far_face, merged_cells, orders, pursuit, quads, ray_steps, windows
 
     loops = [pursuit.choose] if lasting else []
     loops += [far_face.look, ray_steps.brought_in, merged_cells.merge]
-    loops += [orders.reorder, sums.interleave, sums.sum_quads, windows.places]
+    loops += [orders.reorder, cells.cut, cells.interleave, cells.draw, windows.places]
     loops += [quads.pack, quads.pack_some, quads.average, quads.halve]
     renderer = Renderer(Camera.pinhole(400, 400, 101, 75, *SIZE), PANE, lasting=lasting)
     compile_ahead.cache_clear()
