@@ -16,42 +16,50 @@ EIGHT = U(LANES)
 
 
 @compiled
-def cut(counts: Any, places: Any, clear: Any, seen: Any, ends: Any) -> Any:
-    """Write the number of the row after the last of each cell, (M,); returns how many cells there are of M > 0 rows.
+def cut(counts: Any, taps: Any, places: Any, clear: Any, seen: Any, pieces: Any, ends: Any) -> Any:
+    """Write which rows are a cell, and which pieces of the row of texels they look at; returns how many cells it are.
 
-    counts: (M,) of taps, places: (T,) of their texels. clear: (M,) uint16, not 0 where a row shows what is below, too,
-    which takes a place of its own. seen: (ceil(N / 8),) uint32, 0 at first, of pieces of texels: written over.
+    counts: (M,) of taps, M > 0. taps: (T,) texels, in whose stead their places are written; places: (N,) uint32, of
+    each texel. clear: (M,) uint16, not 0 where a row shows what is below, too, which takes a place of its own. seen:
+    (ceil(N / 8),) uint32, 0 at first, of pieces, to work in. pieces: (T,) uint32. ends: (2, M) int64, of each cell, the
+    number of the row after its last, and of the piece.
     """
-    cell, taken, tap, begun = np.uint32(1), U(0), U(0), U(0)
+    cell: Any = np.uint32(1)
+    taken, found, tap, begun = U(0), U(0), U(0), U(0)
+    row: Any
     for row in range(U(len(counts))):
-        end = tap + U(counts[row])
+        end, first = tap + U(counts[row]), found
+        for each in range(tap, end):
+            taps[each] = places[U(taps[each])]
         while True:
-            fresh = U(clear[row] != 0)
             for each in range(tap, end):
-                piece = U(places[each]) // EIGHT
-                fresh += EIGHT * U(seen[piece] != cell)
-                seen[piece] = cell
+                piece = U(taps[each]) // EIGHT
+                if seen[piece] != cell:
+                    seen[piece] = cell
+                    pieces[found] = piece
+                    found += U(1)
+            fresh = EIGHT * (found - first) + U(clear[row] != 0)
             if taken + fresh <= U(PLACES) or row == begun:
                 break
-            ends[U(cell) - U(1)] = row
+            ends[U(0), U(cell) - U(1)], ends[U(1), U(cell) - U(1)] = row, first
             cell += np.uint32(1)
-            taken, begun = U(0), row
+            found, taken, begun = first, U(0), row
         taken += fresh
         tap = end
-    ends[U(cell) - U(1)] = len(counts)
+    ends[U(0), U(cell) - U(1)], ends[U(1), U(cell) - U(1)] = len(counts), found
     return np.int64(cell)
 
 
 @compiled
 def interleave(
-    counts: Any, found: Any, given: Any, clear: Any, below: int, most: Any, places: Any, weights: Any
+    counts: Any, found: Any, given: Any, number: Any, clear: Any, below: int, most: Any, places: Any, weights: Any
 ) -> None:  # fmt: skip
     """Write the taps of eight rows, in turn, the first of each, the second of each, ...; weights of 0 fill up.
 
-    counts: (M,), found, given: (T,) of rows, places and weights. clear: (M,) uint16, the weight of what is below, if
-    not 0, whose places follow one another, the first being `below`. most: (ceil(M / 8),) the largest number of taps of
-    eight rows, 1 at least, by which `places`, uint16, and `weights`, int16, are long. Rows that are missing to eight
-    are as the last.
+    counts: (M,), found, given: (T,) of rows, places in the row of texels, and weights. number: (n,) uint16, of pieces,
+    the place of the first of the eight in the cell. clear: (M,) uint16, the weight of what is below, if not 0, whose
+    places follow one another, the first being `below`. most: (ceil(M / 8),) the largest number of taps of eight rows, 1
+    at least, by which `places`, uint16, and `weights`, int16, are long. Rows that are missing to eight are as the last.
     """
     rows: Any = U(len(counts))
     tap, first, last = rows - rows, rows - rows, rows - rows
@@ -68,7 +76,8 @@ def interleave(
                 continue
             last = lane
             for each in range(U(counts[row])):
-                places[first + each * EIGHT + lane] = found[tap]
+                at = U(found[tap])
+                places[first + each * EIGHT + lane] = U(number[at // EIGHT]) + at % EIGHT
                 weights[first + each * EIGHT + lane] = given[tap]
                 tap += U(1)
             if clear[row]:

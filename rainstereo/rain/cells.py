@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from rainstereo.compiled.layout import BELOW, LANES, PLACES
-from rainstereo.types import Indices
 
 from .lookups import Lookups
 from .quadtree import UNIT
@@ -50,7 +50,7 @@ class Cell:
         )  # fmt: skip
 
 
-class _Room:
+class Room:
     """Memory for many arrays."""
 
     def __init__(self) -> None:
@@ -66,94 +66,97 @@ class _Room:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """All cells of a frame.
+    """All cells of a frame, in parts that are found together.
 
-    tables: in whose order the M rows are counted. counts, pixels: of their rows. clear: (M,) uint16 weights of what is
-    below. roundings: (M,) uint32, `BELOW` and what is added to sums, in 1/`UNIT`. places: (N,) uint32 of each texel in
-    the row of those needed. order: (M,) rows, tile by tile, in each those of as many taps together. groups: where in
-    the order another tile begins.
+    tables: in whose order the M rows are counted. counts, pixels: (M,) of rows; starts: (M,), in its table, of a row's
+    first tap. clear: (M,) uint16 weights of what is below. roundings: (M,) int16, what is added to sums, in 1/`UNIT`.
+    places: (N,) uint32 of each texel in the row of those needed. order: (M,) rows, tile by tile, in each those of as
+    many taps together. parts: where in the order parts begin, and its end.
     """
 
     tables: Sequence[Lookups]
     counts: Any
     pixels: Any
+    starts: Any
     clear: Any
     roundings: Any
     places: Any
     order: Any
-    groups: Indices
+    parts: list[int]
 
     @classmethod
     def of(cls, tables: Sequence[Lookups], clear: Any, roundings: Any, places: Any, width: int) -> Cells:
-        """width: of the frame."""
+        """roundings: more by `BELOW`. width: of the frame."""
         tiles = np.concatenate([table.tiles(width) for table in tables])
         counts = np.concatenate([table.counts for table in tables])
         pixels = np.concatenate([table.pixels for table in tables])
+        starts = np.concatenate([np.cumsum(table.counts, dtype=np.int64) - table.counts for table in tables])
         order = np.lexsort((pixels, counts, tiles))
-        groups = np.flatnonzero(np.diff(tiles[order])) + 1
-        return cls(tables, counts, pixels.view(np.uint32), clear, roundings, places, order.astype(np.int32), groups)
+        others = np.flatnonzero(np.diff(tiles[order])) + 1
+        so_far = np.cumsum(counts[order], dtype=np.int64)
+        begun = others[np.unique(so_far[others - 1] // TOGETHER, return_index=True)[1]]
+        return cls(
+            tables, counts, pixels.view(np.uint32), starts.astype(np.int32), clear,
+            (roundings - np.uint32(BELOW << SHIFT)).astype(np.int16), places, order.astype(np.int32),
+            np.unique([0, *begun.tolist(), len(order)]).tolist(),
+        )  # fmt: skip
 
-    def __iter__(self) -> Iterator[Cell]:
+    @cached_property
+    def taps(self) -> list[int]:
+        """Of each part."""
+        return [int(self.counts[self.order[a:b]].sum(dtype=np.int64)) for a, b in pairwise(self.parts)]
+
+    def of_part(self, which: int, room: Room) -> Iterator[Cell]:
+        """The cells of a part. room: for their taps."""
         from rainstereo.compiled.cells import cut
 
-        so_far = np.cumsum(self.counts[self.order], dtype=np.int64)
-        begun = self.groups[np.unique(so_far[self.groups - 1] // TOGETHER, return_index=True)[1]]
-        size = int(self.places.max(initial=0)) // LANES + 1
-        seen, used, number = np.zeros(size, np.uint32), np.zeros(size, np.bool_), np.zeros(size, np.uint16)
-        room = _Room()
-        for first, last in pairwise(np.unique([0, *begun.tolist(), len(self.order)]).tolist()):
-            rows = self.order[first:last]
-            counts, texels, weights = self._taps(rows)
-            places = self.places[texels]
-            ends: Any = np.empty(len(rows), dtype=np.int64)
-            seen[:] = 0
-            ends = [0, *ends[: cut(counts, places, self.clear[rows], seen, ends)].tolist()]
-            taps = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])[ends].tolist()
-            for some, part in zip(pairwise(ends), pairwise(taps), strict=True):
-                yield self._cell(rows[slice(*some)], places[slice(*part)], weights[slice(*part)], used, number, room)
+        rows = self.order[self.parts[which] : self.parts[which + 1]]
+        counts, clear = self.counts[rows], self.clear[rows]
+        texels, weights = self._taps(rows, counts)
+        every = int(self.places.max(initial=0)) // LANES + 1
+        seen, number = np.zeros(every, dtype=np.uint32), np.zeros(every, dtype=np.uint16)
+        pieces, ends = np.empty(len(texels), dtype=np.uint32), np.zeros((2, len(rows) + 1), dtype=np.int64)
+        count = cut(counts, texels, self.places, clear, seen, pieces, ends[:, 1:])  # texels are places from here on
+        of_rows, of_pieces = ends[:, : count + 1].tolist()
+        of_taps = np.append(0, np.cumsum(counts, dtype=np.int64))[of_rows].tolist()
+        for some, part, near in zip(pairwise(of_rows), pairwise(of_taps), pairwise(of_pieces), strict=True):
+            own: Any = np.sort(pieces[slice(*near)])
+            yield self._cell(rows[slice(*some)], texels[slice(*part)], weights[slice(*part)], own, number, room)
 
-    def _taps(self, rows: Any) -> tuple[Any, Any, Any]:
-        """How many taps rows have, and their texels and weights, one row after the other."""
+    def _taps(self, rows: Any, counts: Any) -> tuple[Any, Any]:
+        """Texels and weights of rows, one row after the other."""
         from rainstereo.compiled.orders import reorder
 
-        counts, starts = self.counts[rows], np.empty(len(rows), dtype=np.int64)
+        starts: Any = self.starts[rows].astype(np.int64)
         texels, weights, held, begin = [], [], 0, 0
         for table in self.tables:
             some = np.flatnonzero((rows >= begin) & (rows < begin + len(table.counts)))
             if some.size:
-                own = rows[some] - begin
-                first, last = int(own.min()), int(own.max()) + 1  # all between, if the table is in order
-                ends = np.cumsum(table.counts[:last], dtype=np.int64)
-                taps = slice(int(ends[first - 1]) if first else 0, int(ends[-1]))
-                starts[some] = ends[own] - table.counts[own] - taps.start + held
-                texels.append(table.texels[taps])
-                weights.append(table.weights[taps])
-                held += taps.stop - taps.start
+                own = starts[some]
+                first, last = int(own.min()), int((own + counts[some]).max())  # all between, if the table is in order
+                texels.append(table.texels[first:last])
+                weights.append(table.weights[first:last])
+                starts[some] += held - first
+                held += last - first
             begin += len(table.counts)
         given = np.concatenate(texels), np.concatenate(weights)
         found = tuple(np.empty(int(counts.sum(dtype=np.int64)), dtype=of.dtype) for of in given)
         reorder(np.arange(len(rows)), starts, counts, *given, *found)
-        return counts, *found
+        return found[0], found[1]
 
-    def _cell(self, rows: Any, places: Any, weights: Any, used: Any, number: Any, room: _Room) -> Cell:
-        """used, number: of pieces, to work in; none is used before and after."""
+    def _cell(self, rows: Any, places: Any, weights: Any, pieces: Any, number: Any, room: Room) -> Cell:
+        """number: of all pieces, to work in."""
         from rainstereo.compiled.cells import interleave
 
         counts, clear, pixels = self.counts[rows], self.clear[rows], self.pixels[rows]
         soft = clear > 0
-        of_tap = places // LANES
-        used[of_tap] = True
-        pieces = np.flatnonzero(used)
-        used[pieces] = False
         number[pieces] = LANES * np.arange(len(pieces))
-        near = number[of_tap] + (places % LANES).astype(np.uint16)
         most = np.maximum.reduceat(np.maximum(counts + soft, 1), np.arange(0, len(counts), LANES))
         size = LANES * int(most.sum(dtype=np.int64))
         made = room.take(size), room.take(size).view(np.int16)
-        interleave(counts, near, weights, clear, LANES * len(pieces), most, *made)
+        interleave(counts, places, weights, number, clear, LANES * len(pieces), most, *made)
         rest = (0, -len(rows) % LANES)
-        roundings = (self.roundings[rows] - np.uint32(BELOW << SHIFT)).astype(np.int16)
         return Cell(
-            pieces.astype(np.uint32), pixels[soft], np.pad(pixels, rest, mode="edge"),
-            most.astype(np.uint32), *made, np.pad(roundings, rest, mode="edge"),
+            pieces, pixels[soft], np.pad(pixels, rest, mode="edge"), most.astype(np.uint32), *made,
+            np.pad(self.roundings[rows], rest, mode="edge"),
         )  # fmt: skip

@@ -8,7 +8,7 @@ number (`words`).
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -21,14 +21,14 @@ from rainstereo import compiled
 from rainstereo.compiled.layout import BELOW, EVERY, LANES, PACKED, PLACES
 from rainstereo.types import Image
 
-from .cells import MOST, SHIFT, Cell, Cells
+from .cells import MOST, SHIFT, Cell, Cells, Room
 from .lookups import Lookups
 from .pyramid import copies, copy_starts
 from .quadtree import UNIT
 from .texels import Texels
 from .words import clip, packed, unpack
 
-KEPT = 5 << 22  # taps up to which all taps are kept ready for the loop: 4 bytes each
+KEPT, KEPT_PER_PIXEL = 5 << 22, 16  # taps, and taps a pixel, up to which they are kept ready for the loop: 4 bytes each
 MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
 ROWS = 1 << 14  # that are summed at a time: few enough for the caches
 DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black
@@ -174,16 +174,22 @@ class Paste:
         return max(int(table.counts.max()) for table in self.tables) <= MOST
 
     @property
-    def _cells(self) -> Iterable[Cell]:
-        """What the loop takes, kept, or, to spare memory, found anew."""
-        return self._kept if self.taps <= KEPT else self._found
+    def _cells(self) -> Iterator[Cell]:
+        """What the loop takes: kept, or, to spare memory, found anew."""
+        for number, kept in enumerate(self._kept):
+            yield from self._all.of_part(number, Room()) if kept is None else kept
 
     @cached_property
-    def _kept(self) -> list[Cell]:
-        return list(self._found)
+    def _kept(self) -> list[list[Cell] | None]:
+        room, so_far = Room(), np.cumsum(self._all.taps).tolist()
+        return [list(self._all.of_part(i, room)) if upto <= self._most else None for i, upto in enumerate(so_far)]
 
     @property
-    def _found(self) -> Cells:
+    def _most(self) -> int:
+        return max(KEPT, KEPT_PER_PIXEL * self.size[0] * self.size[1])
+
+    @cached_property
+    def _all(self) -> Cells:
         clear, roundings = np.concatenate(self._clear), np.concatenate(self._roundings)
         return Cells.of(self.tables, clear, roundings, self._places, self.width)
 

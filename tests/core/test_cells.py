@@ -40,16 +40,21 @@ def table(rng: np.random.Generator, pixels: np.ndarray, most: int) -> Lookups:
 @pytest.mark.parametrize(("rows", "most"), [(1, 0), (1, 30), (3000, 30), (200, 400), (70_000, 0)])
 def test_cells_hold_as_many_rows_as_there_is_room_for(rows, most):
     counts, texels, clear = rows_of(np.random.default_rng(rows), rows, most)
-    ends = np.empty(rows, dtype=np.int64)
-    found = ends[: cut(counts, texels, clear, np.zeros(copy_starts(SIZE)[-1] // 8 + 1, np.uint32), ends)].tolist()
+    places = np.random.default_rng(4).permutation(copy_starts(SIZE)[-1]).astype(np.uint32)
+    taps, seen = texels.copy(), np.zeros(len(places) // 8 + 1, dtype=np.uint32)
+    pieces, ends = np.empty(len(texels), dtype=np.uint32), np.empty((2, rows), dtype=np.int64)
+    found, looked = ends[:, : cut(counts, taps, places, clear, seen, pieces, ends)].tolist()
     assert found[-1] == rows
+    np.testing.assert_array_equal(taps, places[texels])
     so_far = [0, *np.cumsum(counts).tolist()]
 
     def needed(first: int, last: int) -> int:
-        pieces = np.unique(texels[so_far[first] : so_far[last]] // 8)
-        return 8 * len(pieces) + np.count_nonzero(clear[first:last])
+        return 8 * len(np.unique(taps[so_far[first] : so_far[last]] // 8)) + np.count_nonzero(clear[first:last])
 
-    for first, last in itertools.pairwise([0, *found]):
+    parts = itertools.pairwise([0, *looked])
+    for (first, last), part in zip(itertools.pairwise([0, *found]), parts, strict=True):
+        own = np.unique(taps[so_far[first] : so_far[last]] // 8)
+        np.testing.assert_array_equal(np.sort(pieces[slice(*part)]), own)
         assert needed(first, last) <= PLACES
         assert last == rows or needed(first, last + 1) > PLACES
     assert len(found) > 3 or rows == 1 or most == 0
@@ -72,8 +77,9 @@ def test_sums_are_those_without_cells(ordered, held, monkeypatch):
     below = rng.integers(0, 256, (*FRAME[::-1], 3), dtype=np.uint8)
     paste, ours, plain = Paste(tables, SIZE, FRAME[0]), below.copy(), below.copy()
     paste.paste(scene, below, ours)
-    assert len(paste._kept) > 3
-    drawn = np.concatenate([cell.pixels for cell in paste._kept])
+    drawn = [cell.pixels for part in paste._kept for cell in part or []]
+    assert len(drawn) > 3
+    drawn = np.concatenate(drawn)
     np.testing.assert_array_equal(np.unique(drawn), np.sort(pixels[:9003]))
     monkeypatch.setattr(compiled, "available", lambda: False)
     paste.paste(scene, below, plain)

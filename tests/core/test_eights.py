@@ -42,7 +42,10 @@ def test_sums_against_whole_numbers(rows, channels):
     most = np.zeros(groups, dtype=np.uint32)
     np.maximum.at(most, np.arange(rows) // 8, np.maximum(counts + (clear > 0), 1).astype(np.uint32))
     places, factors = (np.empty(8 * int(most.sum()), dtype=kind) for kind in (np.uint16, np.int16))
-    interleave(counts, of_tap.astype(np.uint16), weights, clear, len(values), most, places, factors)
+    number = np.zeros(60, dtype=np.uint16)
+    number[pieces] = 8 * np.arange(len(pieces))
+    found = 8 * pieces[of_tap // 8] + of_tap % 8
+    interleave(counts, found, weights, number, clear, len(values), most, places, factors)
     roundings = rng.integers(0, 1024, rows).astype(np.int16)
     full = np.minimum(np.arange(8 * groups), rows - 1)
     out, near = below.copy(), np.empty(PLACES, dtype=np.uint32)
