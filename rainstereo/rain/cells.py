@@ -18,13 +18,14 @@ import numpy as np
 
 from rainstereo.compiled.layout import BELOW, LANES, PLACES
 
+from .large_pages import numbers
 from .lookups import Lookups
 from .quadtree import UNIT
 
 SHIFT = UNIT.bit_length() - 1
 TOGETHER = 1 << 20  # taps whose rows are put in order at a time
 MOST = PLACES // LANES - 1  # taps of a row: one more for what is below
-BLOCK = 1 << 23  # numbers of 16 bits that are held in one piece of memory, large enough to lie on few, large pages
+BLOCK = 1 << 23  # numbers of 16 bits that are held in one piece of memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class Room:
     def take(self, size: int) -> Any:
         """(size,) uint16, to be written."""
         if size > len(self._left):
-            self._left = np.empty(max(size, BLOCK), dtype=np.uint16)
+            self._left = numbers(np.uint16, max(size, BLOCK))
         taken, self._left = self._left[:size], self._left[size:]
         return taken
 

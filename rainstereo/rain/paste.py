@@ -22,6 +22,7 @@ from rainstereo.compiled.layout import BELOW, EVERY, LANES, PACKED, PLACES
 from rainstereo.types import Image
 
 from .cells import MOST, SHIFT, Cell, Cells, Room
+from .large_pages import numbers
 from .lookups import Lookups
 from .pyramid import copies, copy_starts
 from .quadtree import UNIT
@@ -97,7 +98,7 @@ class Paste:
         try:
             row = self._spare.pop()
         except IndexError:
-            row = np.zeros(PLACES + end + self._needed.fine, dtype=np.uint32)
+            row = numbers(np.uint32, PLACES + end + self._needed.fine)
         near, texels, fine = row[:PLACES], row[PLACES : PLACES + end], row[PLACES + end :]
         self._needed.put_quads(scene, texels[: self._needed.ends[-1]], fine)
         for cell in self._cells:
