@@ -63,6 +63,12 @@ class Lookups:
         """How much it takes to hold and to order the table, in taps."""
         return len(self.texels) + ROW * len(self.pixels)
 
+    @property
+    def bytes_of_taps(self) -> int:
+        """Of memory that texels and weights take."""
+        held = getattr(self.texels, "taps", None)
+        return int(held.nbytes if held is not None else self.texels.nbytes + self.weights.nbytes)
+
     @classmethod
     def joined(cls, parts: list[Lookups], most: int = JOINED) -> list[Lookups]:
         """The same in few tables of such a `size` at most; empties the list, to spare memory."""

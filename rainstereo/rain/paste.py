@@ -29,7 +29,9 @@ from .quadtree import UNIT
 from .texels import Texels
 from .words import clip, packed, unpack
 
-KEPT, KEPT_PER_PIXEL = 5 << 22, 16  # taps, and taps a pixel, up to which they are kept ready for the loop: 4 bytes each
+HELD, SMALL = 108, 1 << 20
+"""Bytes for each pixel of an image, but for so many at least, that taps may take, in tables and ready for the loop."""
+READY = 4  # bytes of a tap that is ready for the loop
 MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
 ROWS = 1 << 14  # that are summed at a time: few enough for the caches
 DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black
@@ -76,6 +78,7 @@ class Paste:
         self.taps = sum(len(table.texels) for table in self.tables)
         self._matrices: dict[type, list[Any]] = {}
         self._spare: deque[Any] = deque()  # memory for words, of which threads take one each
+        self._again = False
 
     def paste(self, scene: Image, below: Image, out: Image) -> None:
         """Write the pixels of a frame. scene: the clear image. below: the frame's part of it. out: (H, W[, C])."""
@@ -176,18 +179,19 @@ class Paste:
 
     @property
     def _cells(self) -> Iterator[Cell]:
-        """What the loop takes: kept, or, to spare memory, found anew."""
-        for number, kept in enumerate(self._kept):
-            yield from self._all.of_part(number, Room()) if kept is None else kept
+        """What the loop takes: kept, or found anew for a first frame, which may be the only one, or to spare memory."""
+        ready = self._kept if self._again else []
+        self._again = True
+        yield from (cell for part in ready for cell in part)
+        for number in range(len(ready), len(self._all.taps)):
+            yield from self._all.of_part(number, Room())
 
     @cached_property
-    def _kept(self) -> list[list[Cell] | None]:
-        room, so_far = Room(), np.cumsum(self._all.taps).tolist()
-        return [list(self._all.of_part(i, room)) if upto <= self._most else None for i, upto in enumerate(so_far)]
-
-    @property
-    def _most(self) -> int:
-        return max(KEPT, KEPT_PER_PIXEL * self.size[0] * self.size[1])
+    def _kept(self) -> list[list[Cell]]:
+        """The cells of as many parts as there is room for."""
+        most = HELD * max(self.size[0] * self.size[1], SMALL) - sum(table.bytes_of_taps for table in self.tables)
+        room, parts = Room(), np.searchsorted(READY * np.cumsum(self._all.taps), most, "right")
+        return [list(self._all.of_part(number, room)) for number in range(int(parts))]
 
     @cached_property
     def _all(self) -> Cells:

@@ -77,7 +77,7 @@ def test_sums_are_those_without_cells(ordered, held, monkeypatch):
     below = rng.integers(0, 256, (*FRAME[::-1], 3), dtype=np.uint8)
     paste, ours, plain = Paste(tables, SIZE, FRAME[0]), below.copy(), below.copy()
     paste.paste(scene, below, ours)
-    drawn = [cell.pixels for part in paste._kept for cell in part or []]
+    drawn = [cell.pixels for part in paste._kept for cell in part]
     assert len(drawn) > 3
     drawn = np.concatenate(drawn)
     np.testing.assert_array_equal(np.unique(drawn), np.sort(pixels[:9003]))
