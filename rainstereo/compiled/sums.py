@@ -1,4 +1,4 @@
-"""Weighted sums of numbers, row by row of a table (`rain.lookups`)."""
+"""Weighted sums, row by row of a table (`rain.lookups`); those of bytes for frames that `cells` would not pay for."""
 
 from __future__ import annotations
 
@@ -6,9 +6,56 @@ from typing import Any
 
 import numpy as np
 
-from .compile import compiled
+from .compile import compiled, fused, fused_part
+from .layout import BELOW
+from .quads import quad_of
 
 U = np.uint64
+BYTE, HALF = U(0xFF), U(32)
+SECOND, FOURTH, LOWER = U(0xFF00), U(0xFF000000), U(0xFFFFFFFF)
+
+
+@fused
+def sum_quads(
+    out: Any, channels: int, quads: Any, below: Any, shift: int, pixels: Any, counts: Any, places: Any, weights: Any,
+    clear: Any, roundings: Any,
+) -> None:  # fmt: skip
+    """Write pixels: sums of bytes times weights.
+
+    out, below: (P, channels) uint8, of one to four channels. quads: (N,) uint32. shift: bits of a weight's unit.
+    pixels, counts: (M,) uint32, int32 of rows. places, weights: (T,) uint32, int16 of their taps. clear: (M,) uint16,
+    the weight of the pixel below. roundings: (M,) uint32, what is added, and `BELOW`, in units of weights.
+    """
+    tap = U(0)
+    for row in range(U(len(counts))):
+        start, end, pixel = U(roundings[row]), tap + U(counts[row]), U(pixels[row])
+        low = start | (start << HALF)  # two channels in a number: what is borrowed below 0 is paid back with `BELOW`
+        high = low
+        for each in range(tap, end):
+            weight, quad = U(np.int64(weights[each])), U(quads[U(places[each])])
+            low += first_two(quad) * weight
+            high += last_two(quad) * weight
+        if clear[row]:
+            weight, quad = U(clear[row]), U(quad_of(below, pixel))
+            low += first_two(quad) * weight
+            high += last_two(quad) * weight
+        tap = end
+        for channel in range(U(channels)):
+            total = low if channel < U(2) else high
+            total = total >> HALF if channel & U(1) else total & LOWER
+            out[pixel, channel] = np.uint8(min(max(np.int64(total >> U(shift)) - BELOW, 0), 255))
+
+
+@fused_part
+def first_two(quad: Any) -> Any:
+    """The first two bytes, 32 bits apart."""
+    return (quad & BYTE) | ((quad & SECOND) << U(24))
+
+
+@fused_part
+def last_two(quad: Any) -> Any:
+    """The last two, likewise."""
+    return ((quad >> U(16)) & BYTE) | ((quad & FOURTH) << U(8))
 
 
 @compiled

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -102,16 +101,14 @@ class Cells:
             np.unique([0, *begun.tolist(), len(order)]).tolist(),
         )  # fmt: skip
 
-    @cached_property
-    def taps(self) -> list[int]:
-        """Of each part."""
-        return [int(self.counts[self.order[a:b]].sum(dtype=np.int64)) for a, b in pairwise(self.parts)]
+    def __iter__(self) -> Iterator[Cell]:
+        room = Room()
+        for first, last in pairwise(self.parts):
+            yield from self._of_rows(self.order[first:last], room)
 
-    def of_part(self, which: int, room: Room) -> Iterator[Cell]:
-        """The cells of a part. room: for their taps."""
+    def _of_rows(self, rows: Any, room: Room) -> Iterator[Cell]:
         from rainstereo.compiled.cells import cut
 
-        rows = self.order[self.parts[which] : self.parts[which + 1]]
         counts, clear = self.counts[rows], self.clear[rows]
         texels, weights = self._taps(rows, counts)
         every = int(self.places.max(initial=0)) // LANES + 1

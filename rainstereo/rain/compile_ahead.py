@@ -79,4 +79,6 @@ def _draw() -> None:
     table = Lookups.of(one, one, taps, np.zeros(1), np.zeros((1, 2)), np.zeros(1, dtype=np.bool_)).ordered(SIDE)
     image = np.zeros((SIDE, SIDE, 3), dtype=np.uint8)
     for some in (table, table.narrow((SIDE, SIDE))[0]):
-        Paste([some], (SIDE, SIDE), SIDE).paste(image, image, image.copy())
+        paste = Paste([some], (SIDE, SIDE), SIDE)
+        for _ in range(2):  # the second time, otherwise than the first
+            paste.paste(image, image, image.copy())

@@ -21,7 +21,7 @@ from rainstereo import compiled
 from rainstereo.compiled.layout import BELOW, EVERY, LANES, PACKED, PLACES
 from rainstereo.types import Image
 
-from .cells import MOST, SHIFT, Cell, Cells, Room
+from .cells import MOST, SHIFT, Cell, Cells
 from .large_pages import numbers
 from .lookups import Lookups
 from .pyramid import copies, copy_starts
@@ -85,7 +85,7 @@ class Paste:
         if not self.tables:
             return
         target, beneath = _flat(out), _flat(below)
-        if out.dtype == np.uint8 and compiled.available() and self._fits:
+        if out.dtype == np.uint8 and compiled.available():
             self._quads(scene, beneath, target)
             return
         levels = self._needed.levels(scene)
@@ -96,7 +96,9 @@ class Paste:
                 self._words(levels, beneath, target, slice(first, min(first + PACKED, target.shape[1])))
 
     def _quads(self, scene: Image, below: Image, out: Image) -> None:
-        """Sums of bytes in compiled loops, all channels together."""
+        """Sums of bytes in compiled loops, all channels together; the first time, perhaps the only one, row by row."""
+        from rainstereo.compiled.sums import sum_quads
+
         end = -(-self._needed.ends[-1] // LANES) * LANES
         try:
             row = self._spare.pop()
@@ -104,8 +106,18 @@ class Paste:
             row = numbers(np.uint32, PLACES + end + self._needed.fine)
         near, texels, fine = row[:PLACES], row[PLACES : PLACES + end], row[PLACES + end :]
         self._needed.put_quads(scene, texels[: self._needed.ends[-1]], fine)
-        for cell in self._cells:
-            cell.draw(out, texels, below, near)
+        if self._again and self._is_kept:
+            for cell in self._kept:
+                cell.draw(out, texels, below, near)
+        else:
+            for piece, places in self._placed:
+                rows, clear = piece.rows, self._clear[piece.number][piece.rows]
+                sum_quads(
+                    out, out.shape[1], texels, below, SHIFT, piece.table.pixels[rows].view(np.uint32),
+                    piece.table.counts[rows], places, piece.table.weights[piece.taps], clear,
+                    self._roundings[piece.number][rows],
+                )  # fmt: skip
+        self._again = True
         self._spare.append(row)
 
     def _words(self, levels: list[Image], below: Image, out: Image, part: slice) -> None:
@@ -173,30 +185,16 @@ class Paste:
                 yield some, self._places[some.table.texels[some.taps]]
 
     @cached_property
-    def _fits(self) -> bool:
-        """Whether a cell has room for each row: those of a renderer have a few hundred taps at most."""
-        return max(int(table.counts.max()) for table in self.tables) <= MOST
-
-    @property
-    def _cells(self) -> Iterator[Cell]:
-        """What the loop takes: kept, or found anew for a first frame, which may be the only one, or to spare memory."""
-        ready = self._kept if self._again else []
-        self._again = True
-        yield from (cell for part in ready for cell in part)
-        for number in range(len(ready), len(self._all.taps)):
-            yield from self._all.of_part(number, Room())
+    def _is_kept(self) -> bool:
+        """Whether there is room for cells, and in a cell for each row: a renderer's have a few hundred taps at most."""
+        held = sum(table.bytes_of_taps for table in self.tables) + READY * self.taps
+        most = max(int(table.counts.max()) for table in self.tables)
+        return held <= HELD * max(self.size[0] * self.size[1], SMALL) and most <= MOST
 
     @cached_property
-    def _kept(self) -> list[list[Cell]]:
-        """The cells of as many parts as there is room for."""
-        most = HELD * max(self.size[0] * self.size[1], SMALL) - sum(table.bytes_of_taps for table in self.tables)
-        room, parts = Room(), np.searchsorted(READY * np.cumsum(self._all.taps), most, "right")
-        return [list(self._all.of_part(number, room)) for number in range(int(parts))]
-
-    @cached_property
-    def _all(self) -> Cells:
+    def _kept(self) -> list[Cell]:
         clear, roundings = np.concatenate(self._clear), np.concatenate(self._roundings)
-        return Cells.of(self.tables, clear, roundings, self._places, self.width)
+        return list(Cells.of(self.tables, clear, roundings, self._places, self.width))
 
     @cached_property
     def _places(self) -> Any:

@@ -76,8 +76,9 @@ def test_sums_are_those_without_cells(ordered, held, monkeypatch):
     scene = rng.integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
     below = rng.integers(0, 256, (*FRAME[::-1], 3), dtype=np.uint8)
     paste, ours, plain = Paste(tables, SIZE, FRAME[0]), below.copy(), below.copy()
-    paste.paste(scene, below, ours)
-    drawn = [cell.pixels for part in paste._kept for cell in part]
+    for _ in range(2):
+        paste.paste(scene, below, ours)
+    drawn = [cell.pixels for cell in paste._kept]
     assert len(drawn) > 3
     drawn = np.concatenate(drawn)
     np.testing.assert_array_equal(np.unique(drawn), np.sort(pixels[:9003]))
@@ -98,7 +99,8 @@ def test_rows_of_more_texels_than_a_cell_has_room_for(monkeypatch):
     )
     scene = rng.integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
     paste, ours, plain = Paste([wide], SIZE, FRAME[0]), *np.zeros((2, *FRAME[::-1], 3), dtype=np.uint8)
-    paste.paste(scene, scene, ours)
+    for _ in range(2):
+        paste.paste(scene, scene, ours)
     monkeypatch.setattr(compiled, "available", lambda: False)
     paste.paste(scene, scene, plain)
     np.testing.assert_array_equal(ours, plain)
