@@ -27,7 +27,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from . import footprint
+from . import footprint, types
 from .camera import Camera
 from .chamber import Chamber
 from .covered_patch import strips
@@ -143,27 +143,38 @@ class DefocusedPatch:
     @cached_property
     def _strips(self) -> list[_Strip]:
         """Those of which a drop covers some, and not darkly."""
-        found = [self._strip(rows) for rows in strips(*self.patch.shape, self._each)]
+        each = self._each
+        every = list(strips(*self.patch.shape, each))
+        longest = max((rows.stop - rows.start for rows in every), default=0) * self.patch.shape[1]
+        numbers = np.arange(longest, dtype=np.int32)  # which all matrices share
+        found = [self._strip(rows, numbers) for rows in every]
         return [strip for strip in found if strip is not None]
 
-    def _strip(self, rows: slice) -> _Strip | None:
-        """What is needed of samples in some rows, whole cells high; None if there are none that show anything."""
+    def _strip(self, rows: slice, numbers: types.Indices) -> _Strip | None:
+        """What is needed of samples in some rows, whole cells high; None if there are none that show anything.
+
+        Samples are put in the order of their cells, in each from the first row to the last.
+        """
         each, across = self._each, self._shape[1]
-        source, gain, opacity = self.patch.strip(rows.start, rows.stop)
-        weight = np.ravel(gain * opacity)
-        covered = np.flatnonzero(weight).astype(np.int32)
-        if not covered.size:
-            return None
-        y, x = np.divmod(covered, opacity.shape[1])
-        cell = y // each * across + x // each
         cells = slice(rows.start // each, rows.stop // each)
-        count = -(-len(covered) // ACROSS) * ACROSS
+
+        def by_cell(values: Array) -> Array:
+            return values.reshape(-1, each, across, each).swapaxes(1, 2).reshape(-1, each**2)
+
+        source, gain, opacity = self.patch.strip(rows.start, rows.stop)
+        weight = by_cell(gain * opacity)
+        covered = weight != 0
+        ends = np.cumsum(np.count_nonzero(covered, axis=1), dtype=np.int32)
+        number = int(ends[-1])
+        if not number:
+            return None
+        count = -(-number // ACROSS) * ACROSS
         sums = csr_array(
-            (weight[covered] / each**2, (cell, np.arange(len(covered), dtype=np.int32))),
-            ((cells.stop - cells.start) * across, count), dtype=np.float32,
-        )  # fmt: skip
+            (weight[covered] / each**2, numbers[:number], np.append(np.int32(0), ends)), (len(weight), count)
+        )
         at: Image = np.zeros((2, count // ACROSS, ACROSS), dtype=np.float32)
-        at.reshape(2, count)[:, : len(covered)] = source.reshape(-1, 2)[covered].T
+        for part, along in zip(at, np.moveaxis(source, -1, 0), strict=True):
+            part.reshape(-1)[:number] = by_cell(along)[covered]
         return _Strip(cells, sums, [self._table(at, kernel) for kernel in self._kernels])
 
     def _table(self, source: Array, kernel: Array) -> tuple[Any, Any]:
