@@ -8,7 +8,7 @@ import numpy as np
 
 from .patch import Patch, sample_shape
 from .trace import Trace
-from .types import Array, Indices, Mask
+from .types import Array, Image, Indices, Mask
 
 STRIP = 1 << 18  # samples that are worked on at a time
 
@@ -91,28 +91,30 @@ class CoveredPatch(Patch):
         """Source, gain and opacity of the samples' rows from first to before last."""
         covered = self._covered[first:last]
         some = slice(int(self._begins[first]), int(self._begins[first + len(covered)]))
-        pairs = np.zeros(covered.shape, dtype=np.complex64)  # a source is one number for numpy, which is faster
+        pairs: Image = np.zeros(covered.shape, dtype=np.complex64)  # a source is one number for numpy, which is faster
         pairs[covered] = self._source[some].view(np.complex64)[:, 0]
-        source, gain = pairs.view(np.float32).reshape(*covered.shape, 2), np.zeros(covered.shape, dtype=np.float32)
+        source: Image = pairs.view(np.float32).reshape(*covered.shape, 2)
+        gain: Image = np.zeros(covered.shape, dtype=np.float32)
         gain[covered] = self._gain[some]
         if any(self._aside):
             source += np.array(self._aside, dtype=np.float32)
-        return source, gain, covered.astype(np.float32)
+        opacity: Image = covered.astype(np.float32)
+        return source, gain, opacity
 
     @property
-    def source(self) -> Array:  # type: ignore[override]
+    def source(self) -> Array:
         """(h', w', 2) float32; see `Patch`."""
         return self.strip(0, len(self._covered))[0]
 
     @property
-    def gain(self) -> Array:  # type: ignore[override]
+    def gain(self) -> Array:
         """(h', w') float32."""
         return self.strip(0, len(self._covered))[1]
 
     @property
-    def opacity(self) -> Array:  # type: ignore[override]
+    def opacity(self) -> Array:
         """(h', w') float32."""
-        return self._covered.astype(np.float32)
+        return self.strip(0, len(self._covered))[2]
 
     def moved(self, x: int, y: int) -> CoveredPatch:
         """The same in an image that begins so many pixels farther left and up; without a copy of the samples."""

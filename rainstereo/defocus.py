@@ -220,9 +220,9 @@ class DefocusedPatch:
         covers: Image = np.empty(self._shape, dtype=np.float32)
         each = self._each
         for rows in strips(*self.patch.shape, each):
-            opacity = self.patch.strip(rows.start, rows.stop)[2]
+            fine = self.patch.strip(rows.start, rows.stop)[2]
             cells = covers[rows.start // each : rows.stop // each]
-            cells[...] = cv2.resize(opacity, cells.shape[::-1], interpolation=cv2.INTER_AREA) if each > 1 else opacity
+            cells[...] = cv2.resize(fine, cells.shape[::-1], interpolation=cv2.INTER_AREA) if each > 1 else fine
         opacity: Image = np.zeros(self._shape, dtype=np.float32)
         for kernel in self._kernels:
             add_blurred(opacity, covers, kernel)

@@ -111,7 +111,8 @@ class BlurredLayer:
         height, width = patch.rows.stop - patch.rows.start, patch.columns.stop - patch.columns.start
         if not math.prod(patch.shape):
             return *window, np.zeros((0, 0), np.bool_), np.zeros((0, 0, 2), np.float32)
-        hidden, mean = np.empty((height, width), np.bool_), np.empty((height, width, 2), np.float32)
+        hidden = np.empty((height, width), np.bool_)
+        mean: Image = np.empty((height, width, 2), np.float32)
         y, x = (at.astype(np.float32) for at in sample_lines(patch.rows, patch.columns, patch.density))
         for pixels, rows in self._strips():
             source, gain, opacity = patch.strip(rows.start, rows.stop)

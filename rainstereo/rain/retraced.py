@@ -19,12 +19,12 @@ from rainstereo.covered_patch import CoveredPatch, strips
 from rainstereo.droplet import Drop
 from rainstereo.patch import Patch, answers, ratio, sample_shape
 from rainstereo.trace import clear_transmittance, trace
-from rainstereo.types import Array, Indices, Mask
+from rainstereo.types import Array, Image, Indices, Mask
 
 from .outlines import Outlines
 
 RAYS = 1 << 16  # at a time
-NOTHING = np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32)
+NOTHING: tuple[Image, ...] = np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32)
 Window = tuple[slice, slice]
 
 
@@ -62,10 +62,11 @@ def retraced(
     for some in _runs(np.count_nonzero(asked, axis=1)):
         at = np.flatnonzero(asked[some])
         places = _places(at + some.start * width, window, samples, width)
-        found = _answers(places, drops, camera, chamber, depth) if at.size else NOTHING
+        found: tuple[Image, ...] = _answers(places, drops, camera, chamber, depth) if at.size else NOTHING
         for band in strips(some.stop - some.start, width):
             down = slice(some.start + band.start, some.start + band.stop)
-            parts = [np.zeros((band.stop - band.start, width, *values.shape[1:]), np.float32) for values in found]
+            shape = band.stop - band.start, width
+            parts: list[Image] = [np.zeros((*shape, *values.shape[1:]), np.float32) for values in found]
             if old is not None:
                 old.put(parts, down)
             ends = np.searchsorted(at, (band.start * width, band.stop * width))
@@ -81,10 +82,11 @@ class _Filling:
 
     def __init__(self, height: int, width: int, most: int) -> None:
         self.covered = np.zeros((height, width), dtype=np.bool_)
-        self.source, self.gain = np.empty((most, 2), np.float32), np.empty(most, np.float32)
+        self.source: Image = np.empty((most, 2), np.float32)
+        self.gain: Image = np.empty(most, np.float32)
         self.count = 0
 
-    def add(self, down: slice, parts: Sequence[Array]) -> None:
+    def add(self, down: slice, parts: Sequence[Image]) -> None:
         """Rows of the patch: source, gain and opacity."""
         source, gain, opacity = parts
         seen = np.not_equal(opacity, 0, out=self.covered[down])
@@ -130,7 +132,7 @@ class _Kept:
         changed = _circles(list(set(drops) ^ set(before.drops)), camera, chamber, window, samples)
         return cls(before.patch, here, there, changed)
 
-    def put(self, parts: Sequence[Array], down: slice) -> None:
+    def put(self, parts: Sequence[Image], down: slice) -> None:
         """Write what is taken over to rows of the patch."""
         first, last = max(down.start, self.here[0].start), min(down.stop, self.here[0].stop)
         if first >= last:
