@@ -11,10 +11,10 @@ from typing import Any
 from numba.core import types
 from numba.extending import intrinsic
 
-from .layout import LANES, LONG_BITS, SHORT_BITS
+from .layout import LANES
 from .llvm import BYTE, FOUR, LONG, TWO, alike, arguments, ir, load, spread, store
 
-VECTOR = ir.VectorType(FOUR, LANES)
+VECTOR, SHORTS = ir.VectorType(FOUR, LANES), ir.VectorType(TWO, LANES)
 LAST = 255
 
 
@@ -23,44 +23,38 @@ def _summing(channels: int) -> Any:
 
     @intrinsic
     def eight(
-        _context: Any, out: Any, quads: Any, shift: Any, pixels: Any, row: Any, taps: Any, first: Any, end: Any,
-        roundings: Any,
+        _context: Any, out: Any, quads: Any, shift: Any, pixels: Any, row: Any, places: Any, weights: Any, first: Any,
+        end: Any, roundings: Any,
     ) -> Any:  # fmt: skip
         def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             _write(builder, channels, *arguments(context, builder, signature, given))
             return context.get_dummy_value()
 
         number = types.uint64
-        return types.void(out, quads, types.uint32, pixels, number, taps, number, number, roundings), code
+        return types.void(out, quads, types.uint32, pixels, number, places, weights, number, number, roundings), code
 
     return eight
 
 
 def _write(
-    builder: Any, channels: int, out: Any, quads: Any, shift: Any, pixels: Any, row: Any, taps: Any, first: Any,
-    end: Any, roundings: Any,
+    builder: Any, channels: int, out: Any, quads: Any, shift: Any, pixels: Any, row: Any, places: Any, weights: Any,
+    first: Any, end: Any, roundings: Any,
 ) -> None:  # fmt: skip
-    of_tap = taps.type.pointee
-    bits = SHORT_BITS if of_tap == FOUR else LONG_BITS  # known here, so that weights are known to have 16 bits at most
-    low, high = ir.Constant(of_tap, (1 << bits) - 1), alike(ir.VectorType(of_tap, LANES), bits)
-    start = load(builder, roundings, row, VECTOR)
+    start = builder.sext(load(builder, roundings, row, SHORTS), VECTOR)
     before, loop, after = builder.block, builder.append_basic_block("tap"), builder.append_basic_block("write")
     builder.branch(loop)
 
     builder.position_at_end(loop)  # one tap of each pixel: quads are fetched one by one, and weighted together
     tap, sums = builder.phi(LONG), [builder.phi(VECTOR) for _ in range(channels)]
-    weights = builder.ashr(load(builder, taps, tap, ir.VectorType(of_tap, LANES)), high)
-    if of_tap != FOUR:
-        weights = builder.trunc(weights, VECTOR)
+    factors = builder.sext(load(builder, weights, tap, SHORTS), VECTOR)
     found = ir.Constant(VECTOR, ir.Undefined)
     for lane in range(LANES):
-        place = builder.and_(builder.load(builder.gep(taps, [builder.add(tap, ir.Constant(LONG, lane))])), low)
-        place = place if of_tap == LONG else builder.zext(place, LONG)
+        place = builder.zext(builder.load(builder.gep(places, [builder.add(tap, ir.Constant(LONG, lane))])), LONG)
         found = builder.insert_element(found, builder.load(builder.gep(quads, [place])), ir.Constant(FOUR, lane))
     added = []
     for channel, total in enumerate(sums):
         values = builder.and_(builder.lshr(found, alike(VECTOR, 8 * channel)), alike(VECTOR, LAST))
-        added.append(builder.add(total, builder.mul(values, weights)))
+        added.append(builder.add(total, builder.mul(values, factors)))
     following = builder.add(tap, ir.Constant(LONG, LANES))
     builder.cbranch(builder.icmp_unsigned("<", following, end), loop, after)
     tap.add_incoming(first, before)
@@ -93,10 +87,23 @@ def _store(builder: Any, value: Any, at: Any, channels: int) -> None:
             written += count
 
 
-one_channel, two_channels, three_channels, four_channels = (_summing(channels) for channels in (1, 2, 3, 4))
-"""three_channels(out, quads, shift, pixels, row, taps, first, end, roundings): the pixels of rows row to row + 7.
+@intrinsic
+def _copy(_context: Any, source: Any, _first: Any, target: Any, _to: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        data, first, there, to = arguments(context, builder, signature, given)
+        store(builder, load(builder, data, first, VECTOR), there, to)
+        return context.get_dummy_value()
 
-out: (P * 3,) uint8. quads: (N,) uint32. shift: uint32, bits of a weight's unit. pixels: (M,) uint32. taps: signed,
-those of the rows from the number `first` to before `end`, interleaved (`sums.interleave`). roundings: (M,) int32, to
-which sums are added.
+    return types.void(source, types.uint64, target, types.uint64), code
+
+
+copy_eight: Any = _copy
+"""copy_eight(source, first, target, to): eight numbers of 32 bits, from the number `first` on to the number `to`."""
+one_channel, two_channels, three_channels, four_channels = (_summing(channels) for channels in (1, 2, 3, 4))
+"""three_channels(out, quads, shift, pixels, row, places, weights, first, end, roundings): the pixels of rows row to
+row + 7.
+
+out: (P * 3,) uint8. quads: (N,) uint32. shift: uint32, bits of a weight's unit. pixels: (M,) uint32. places, weights:
+(T,) uint16, int16 of taps: those of the rows from the number `first` to before `end`, interleaved
+(`cells.interleave`). roundings: (M,) int16, to which sums are added.
 """

@@ -15,7 +15,6 @@ import numpy as np
 from rainstereo import compiled
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber, Panel
-from rainstereo.compiled.layout import LONG_BITS, SHORT_BITS
 from rainstereo.droplet import SphericalCap
 from rainstereo.types import Indices
 
@@ -79,8 +78,5 @@ def _draw() -> None:
     taps = Taps(texels, weights, one + len(texels), np.zeros(1))
     table = Lookups.of(one, one, taps, np.zeros(1), np.zeros((1, 2)), np.zeros(1, dtype=np.bool_)).ordered(SIDE)
     image = np.zeros((SIDE, SIDE, 3), dtype=np.uint8)
-    for of_tap in ((np.int32, SHORT_BITS), (np.int64, LONG_BITS)):
-        for some in (table, table.narrow((SIDE, SIDE))[0]):
-            paste = Paste([some], (SIDE, SIDE))
-            paste.__dict__["_of_tap"] = of_tap  # as of an image of so many texels
-            paste.paste(image, image, image.copy())
+    for some in (table, table.narrow((SIDE, SIDE))[0]):
+        Paste([some], (SIDE, SIDE), SIDE).paste(image, image, image.copy())

@@ -63,6 +63,12 @@ class Lookups:
         """How much it takes to hold and to order the table, in taps."""
         return len(self.texels) + ROW * len(self.pixels)
 
+    @property
+    def bytes_of_taps(self) -> int:
+        """Of memory that texels and weights take."""
+        held = getattr(self.texels, "taps", None)
+        return int(held.nbytes if held is not None else self.texels.nbytes + self.weights.nbytes)
+
     @classmethod
     def joined(cls, parts: list[Lookups], most: int = JOINED) -> list[Lookups]:
         """The same in few tables of such a `size` at most; empties the list, to spare memory."""
@@ -107,15 +113,9 @@ class Lookups:
         return Lookups(*(a[taps] if name in OF_TAPS else a[keep] for name, a in self.columns()))
 
     def ordered(self, width: int) -> Lookups:
-        """The same, rows that look at the same tile of the scene one after the other. width: of the frame.
-
-        Rows that hide all, those that are clear in part, and dark ones are kept apart, and in a tile those of as many
-        taps: what a loop does next is then what it did before.
-        """
-        own = np.stack([self.pixels % width, self.pixels // width], -1)
-        column, row = np.nan_to_num((self.displacement + own) // TILE).astype(np.int64).T
-        kind = np.where(self.clear > 0, 1, np.where(self.counts > 0, 0, 2))
-        order = np.lexsort((self.pixels, self.counts, _along_curve(column, row), kind))
+        """The same, rows of the same `tiles` one after the other, and in a tile those of as many taps: what a loop does
+        next is then what it did before. width: of the frame."""
+        order = np.lexsort((self.pixels, self.counts, self.tiles(width)))
         given: dict[str, Any] = {name: a[order] for name, a in self.columns() if name not in OF_TAPS}
         texels, weights = np.empty_like(self.texels), np.empty_like(self.weights)
         starts = np.cumsum(self.counts, dtype=np.int64) - self.counts
@@ -133,6 +133,15 @@ class Lookups:
                 texels[made:last], weights[made:last] = self.texels[taps], self.weights[taps]
                 made = last
         return replace(self, texels=texels, weights=weights, **given)
+
+    def tiles(self, width: int) -> Indices:
+        """(M,) the tile of the scene that each row looks at, numbered along a curve, one kind of rows after the other:
+        those that hide all, those that are clear in part, and dark ones."""
+        own = np.stack([self.pixels % width, self.pixels // width], -1)
+        column, row = np.nan_to_num((self.displacement + own) // TILE).astype(np.int64).T
+        kind = np.where(self.clear > 0, 1, np.where(self.counts > 0, 0, 2))
+        tiles: Indices = (kind << 2 * BITS) + _along_curve(column, row)
+        return tiles
 
     def columns(self) -> list[tuple[str, Any]]:
         """Names and values of all fields."""

@@ -1,13 +1,14 @@
 """Drawing tables of taps (`lookups`) over a frame.
 
-Bytes are summed in a compiled loop, eight pixels at a time, all channels of them (`rainstereo.compiled.eights`), or,
-without numba and bit for bit the same, as sparse products of three channels in one number (`words`).
+Bytes are summed in a compiled loop, cell by cell (`cells`), eight pixels at a time, all channels of them
+(`rainstereo.compiled.eights`), or, without numba and bit for bit the same, as sparse products of three channels in one
+number (`words`).
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -17,18 +18,20 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rainstereo import compiled
-from rainstereo.compiled.layout import BELOW, EVERY, LANES, LONG_BITS, PACKED, SHORT_BITS
+from rainstereo.compiled.layout import BELOW, EVERY, LANES, PACKED, PLACES
 from rainstereo.types import Image
 
+from .cells import MOST, SHIFT, Cell, Cells, Room
+from .large_pages import numbers
 from .lookups import Lookups
 from .pyramid import copies, copy_starts
 from .quadtree import UNIT
 from .texels import Texels
 from .words import clip, packed, unpack
 
-SHIFT = UNIT.bit_length() - 1
-KEPT = 5 << 22  # taps up to which all taps are kept ready for the loop: 4 bytes each
-SHORT = 1 << SHORT_BITS  # places, up to which a tap has 32 bits; else it has 64
+HELD, SMALL = 108, 1 << 20
+"""Bytes for each pixel of an image, but for so many at least, that taps may take, in tables and ready for the loop."""
+READY = 4  # bytes of a tap that is ready for the loop
 MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
 ROWS = 1 << 14  # that are summed at a time: few enough for the caches
 DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black
@@ -58,38 +61,31 @@ class Piece:
         return csr_array((weights, places.astype(np.int32), ends), shape=(len(ends) - 1, columns))
 
 
-@dataclass(frozen=True, eq=False)
-class Eights:
-    """What the loop over a piece takes (`compiled.sums.sum_quads`): rows are filled up to a multiple of eight."""
-
-    pixels: Any
-    most: Any
-    taps: Any
-    roundings: Any
-
-
 class Paste:
     """Tables of one frame, and what is done to all pixels of them at once.
 
-    size: (width, height) of the images. soft: (S,) uint32, pixels that show something of what is below.
+    size: (width, height) of the images, width: of the frame. soft: (S,) uint32, pixels that show something of what is
+    below.
     """
 
-    def __init__(self, tables: Sequence[Lookups], size: tuple[int, int]) -> None:
+    def __init__(self, tables: Sequence[Lookups], size: tuple[int, int], width: int) -> None:
         self.tables = [table for table in tables if len(table.pixels)]
         self.size = size
+        self.width = width
         self._clear = [np.rint(table.clear * UNIT).astype(np.uint16) for table in self.tables]
         soft = [table.pixels[clear > 0] for table, clear in zip(self.tables, self._clear, strict=True)]
         self.soft: Any = np.concatenate([np.zeros(0, dtype=np.uint32), *soft]).astype(np.uint32)
         self.taps = sum(len(table.texels) for table in self.tables)
         self._matrices: dict[type, list[Any]] = {}
         self._spare: deque[Any] = deque()  # memory for words, of which threads take one each
+        self._again = False
 
     def paste(self, scene: Image, below: Image, out: Image) -> None:
         """Write the pixels of a frame. scene: the clear image. below: the frame's part of it. out: (H, W[, C])."""
         if not self.tables:
             return
         target, beneath = _flat(out), _flat(below)
-        if out.dtype == np.uint8 and compiled.available():
+        if out.dtype == np.uint8 and compiled.available() and self._fits:
             self._quads(scene, beneath, target)
             return
         levels = self._needed.levels(scene)
@@ -101,19 +97,15 @@ class Paste:
 
     def _quads(self, scene: Image, below: Image, out: Image) -> None:
         """Sums of bytes in compiled loops, all channels together."""
-        from rainstereo.compiled.quads import pack_some
-        from rainstereo.compiled.sums import sum_quads
-
-        end = self._needed.ends[-1]
-        last = end + len(self.soft)
+        end = -(-self._needed.ends[-1] // LANES) * LANES
         try:
             row = self._spare.pop()
         except IndexError:
-            row = np.empty(last + self._needed.fine, dtype=np.uint32)
-        self._needed.put_quads(scene, row[:end], row[last:])
-        pack_some(below, self.soft, row[end:last])
-        for some in self._eights:
-            sum_quads(out.reshape(-1), out.shape[1], row, SHIFT, some.pixels, some.most, some.taps, some.roundings)
+            row = numbers(np.uint32, PLACES + end + self._needed.fine)
+        near, texels, fine = row[:PLACES], row[PLACES : PLACES + end], row[PLACES + end :]
+        self._needed.put_quads(scene, texels[: self._needed.ends[-1]], fine)
+        for cell in self._cells:
+            cell.draw(out, texels, below, near)
         self._spare.append(row)
 
     def _words(self, levels: list[Image], below: Image, out: Image, part: slice) -> None:
@@ -180,39 +172,31 @@ class Paste:
             for some in piece.cut(ROWS):
                 yield some, self._places[some.table.texels[some.taps]]
 
+    @cached_property
+    def _fits(self) -> bool:
+        """Whether a cell has room for each row: those of a renderer have a few hundred taps at most."""
+        return max(int(table.counts.max()) for table in self.tables) <= MOST
+
     @property
-    def _eights(self) -> Iterable[Eights]:
-        """What the loop takes of whole tables, or, to spare memory, of parts of them."""
-        if self.taps <= KEPT:
-            return self._kept
-        return (self._in_eights(some) for piece in self._wholes for some in piece.cut(ROWS))
+    def _cells(self) -> Iterator[Cell]:
+        """What the loop takes: kept, or found anew for a first frame, which may be the only one, or to spare memory."""
+        ready = self._kept if self._again else []
+        self._again = True
+        yield from (cell for part in ready for cell in part)
+        for number in range(len(ready), len(self._all.taps)):
+            yield from self._all.of_part(number, Room())
 
     @cached_property
-    def _kept(self) -> list[Eights]:
-        return [self._in_eights(piece) for piece in self._wholes]
-
-    def _in_eights(self, piece: Piece) -> Eights:
-        from rainstereo.compiled.sums import interleave
-
-        table, counts, clear = piece.table, piece.table.counts[piece.rows], self._clear[piece.number][piece.rows]
-        most = np.maximum.reduceat(np.maximum(counts + (clear > 0), 1), np.arange(0, len(counts), LANES))
-        kind, bits = self._of_tap
-        taps: Any = np.empty(LANES * int(most.sum(dtype=np.int64)), dtype=kind)
-        before = [*self._clear[: piece.number], self._clear[piece.number][: piece.rows.start]]
-        below = self._needed.ends[-1] + sum(np.count_nonzero(some) for some in before)
-        interleave(
-            counts, self._places, table.texels[piece.taps], table.weights[piece.taps], clear, below, bits, most, taps
-        )
-        rest = (0, -len(counts) % LANES)
-        pixels = np.pad(table.pixels[piece.rows].view(np.uint32), rest, mode="edge")
-        roundings = self._roundings[piece.number][piece.rows].astype(np.int32) - (BELOW << SHIFT)
-        return Eights(pixels, most.astype(np.uint32), taps, np.pad(roundings, rest, mode="edge"))
+    def _kept(self) -> list[list[Cell]]:
+        """The cells of as many parts as there is room for."""
+        most = HELD * max(self.size[0] * self.size[1], SMALL) - sum(table.bytes_of_taps for table in self.tables)
+        room, parts = Room(), np.searchsorted(READY * np.cumsum(self._all.taps), most, "right")
+        return [list(self._all.of_part(number, room)) for number in range(int(parts))]
 
     @cached_property
-    def _of_tap(self) -> tuple[type, int]:
-        """Type of taps that have room for all places, of the texels and of the soft pixels after them; bits of one."""
-        short = self._needed.ends[-1] + len(self.soft) <= SHORT
-        return (np.int32, SHORT_BITS) if short else (np.int64, LONG_BITS)
+    def _all(self) -> Cells:
+        clear, roundings = np.concatenate(self._clear), np.concatenate(self._roundings)
+        return Cells.of(self.tables, clear, roundings, self._places, self.width)
 
     @cached_property
     def _places(self) -> Any:

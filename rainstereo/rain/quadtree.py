@@ -35,8 +35,7 @@ JUMP = 4.0
 MERGES = 3
 ALIGNED = 1 << MERGES
 UNIT = 1024
-"""Of weights: whole numbers, so that three channels of a sum fit into one word (see `words`), and that a weight and the
-place of its texel fit into 32 bits."""
+"""Of weights: whole numbers, so that three channels of a sum fit into one word (see `words`)."""
 FEW, DEAR = 2, 2.0
 """Levels with so many texels that making them ready for sums costs as well, and what a tap of these counts for."""
 FINE = 1 << 24

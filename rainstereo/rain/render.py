@@ -354,7 +354,7 @@ class Plan:
         if self.renderer.moving:
             return PasteMoving(self.tables)
         tables = [table for table in self.tables if isinstance(table, Lookups)]
-        return Paste(tables, self.renderer.scene_size)
+        return Paste(tables, self.renderer.scene_size, self.renderer.camera.width)
 
     def _in_light(self, image: Image, out: Image) -> None:
         """The same, averaging light; only pixels that drops touch are converted back."""

@@ -122,6 +122,11 @@ class WindowTaps:
     def __len__(self) -> int:
         return len(self.codes)
 
+    @property
+    def nbytes(self) -> int:
+        """Of memory."""
+        return int(sum(each.nbytes for each in (self.corners, self.codes, self.others, self.large)))
+
 
 @dataclass(frozen=True, eq=False)
 class PairTaps:
@@ -154,6 +159,11 @@ class PairTaps:
 
     def __len__(self) -> int:
         return len(self.pairs)
+
+    @property
+    def nbytes(self) -> int:
+        """Of memory."""
+        return int(self.pairs.nbytes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ import pytest
 pytest.importorskip("numba", reason="numba is not installed (extra fast)")
 
 from rainstereo.compiled import quads
-from rainstereo.compiled.layout import COLUMNS, LONG_BITS, QUARTERS, ROWS, SHORT_BITS
-from rainstereo.compiled.sums import interleave, sum_quads
+from rainstereo.compiled.cells import draw, interleave
+from rainstereo.compiled.layout import COLUMNS, PLACES, QUARTERS, ROWS
 from rainstereo.rain.pyramid import half
 
 SHIFT = 10
@@ -23,30 +23,36 @@ def table(rng: np.random.Generator, rows: int, texels: int) -> tuple[np.ndarray,
     return counts, rng.integers(0, texels, taps).astype(np.int32), weights, clear
 
 
-@pytest.mark.parametrize(("kind", "bits"), [(np.int32, SHORT_BITS), (np.int64, LONG_BITS)])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 @pytest.mark.parametrize("rows", [1, 7, 8, 203])
-def test_sums_against_whole_numbers(rows, channels, kind, bits):
+def test_sums_against_whole_numbers(rows, channels):
+    """Texels are those of some pieces of a row, in another order, and after them what is below."""
     rng = np.random.default_rng(rows + channels)
     texels, pixels = 300, rng.permutation(500)[:rows]
-    values = rng.integers(0, 256, (texels, channels), dtype=np.uint8)
+    pieces = rng.permutation(60)[: -(-texels // 8)].astype(np.uint32)
+    values = rng.integers(0, 256, (8 * len(pieces), channels), dtype=np.uint8)
     below = rng.integers(0, 256, (500, channels), dtype=np.uint8)
     counts, of_tap, weights, clear = table(rng, rows, texels)
     soft = pixels[clear > 0].astype(np.uint32)
-    row = np.zeros(texels + len(soft), dtype=np.uint32)
-    quads.pack(values, row[:texels])
-    quads.pack_some(below, soft, row[texels:])
+    row = np.full(8 * 60, 0xFFFFFFFF, dtype=np.uint32)
+    held = np.empty(len(values), dtype=np.uint32)
+    quads.pack(values, held)
+    row.reshape(-1, 8)[pieces] = held.reshape(-1, 8)
     groups = -(-rows // 8)
     most = np.zeros(groups, dtype=np.uint32)
     np.maximum.at(most, np.arange(rows) // 8, np.maximum(counts + (clear > 0), 1).astype(np.uint32))
-    taps = np.empty(8 * int(most.sum()), dtype=kind)
-    places = np.arange(texels, dtype=np.uint32)
-    interleave(counts, places, of_tap, weights, clear, texels, bits, most, taps)
-    roundings = rng.integers(0, 1024, rows).astype(np.int32)
+    places, factors = (np.empty(8 * int(most.sum()), dtype=kind) for kind in (np.uint16, np.int16))
+    number = np.zeros(60, dtype=np.uint16)
+    number[pieces] = 8 * np.arange(len(pieces))
+    found = 8 * pieces[of_tap // 8] + of_tap % 8
+    interleave(counts, found, weights, number, clear, len(values), most, places, factors)
+    roundings = rng.integers(0, 1024, rows).astype(np.int16)
     full = np.minimum(np.arange(8 * groups), rows - 1)
-    out = below.copy()
-    flat = out.reshape(-1)
-    sum_quads(flat, channels, row, SHIFT, pixels[full].astype(np.uint32), most, taps, roundings[full])
+    out, near = below.copy(), np.empty(PLACES, dtype=np.uint32)
+    draw(
+        out.reshape(-1), channels, row, below, SHIFT, near, pieces, soft, pixels[full].astype(np.uint32), most, places,
+        factors, roundings[full],
+    )  # fmt: skip
 
     expected, ends = below.copy(), np.cumsum(counts)
     for i, pixel in enumerate(pixels):

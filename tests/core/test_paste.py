@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from rainstereo import Camera, Chamber, Panel, compiled
-from rainstereo.compiled.layout import SHORT_BITS
 from rainstereo.droplet import SphericalCap
-from rainstereo.rain import lookups, paste, words
+from rainstereo.rain import cells, lookups, paste, words
 from rainstereo.rain.lookups import Lookups
 from rainstereo.rain.pursuit import Pursuit
 from rainstereo.rain.pyramid import copies, copy_starts, half, sizes
@@ -46,14 +45,19 @@ def drawn(plan: Plan, image: np.ndarray) -> np.ndarray:
 
 
 @needs_numba
-@pytest.mark.parametrize("limits", [{}, {"KEPT": 100, "ROWS": 97}, {"SHORT": 256}], ids=["kept", "in parts", "64 bits"])
+@pytest.mark.parametrize("limits", [{}, {"HELD": 0, "ROWS": 97}], ids=["kept", "anew"])
 @pytest.mark.parametrize("channels", [0, 1, 2, 3, 4])
 def test_compiled_as_not(plan, channels, limits, monkeypatch):
-    """Bit for bit, whether places are kept or found anew, in 32 bits or 64."""
+    """Bit for bit, whether cells are kept or found anew, few or many."""
     image = picture(channels)
     for name, value in limits.items():
         monkeypatch.setattr(paste, name, value)
-    ours = drawn(plan, image)
+    if limits:
+        monkeypatch.setattr(cells, "TOGETHER", 97)
+        monkeypatch.setattr(lookups, "TILE", 16)
+    same = dataclasses.replace(plan)  # which has kept nothing
+    ours, second = same.apply(image), same.apply(image)
+    np.testing.assert_array_equal(ours, second)
     monkeypatch.setattr(compiled, "available", lambda: False)
     monkeypatch.setattr(paste, "MATRICES", 0 if limits else paste.MATRICES)
     np.testing.assert_array_equal(ours, drawn(plan, image))
@@ -215,7 +219,6 @@ def test_words_are_clipped_field_by_field():
     np.testing.assert_array_equal(shown, np.clip(values, 0, 255).T)
 
 
-def test_weights_and_places_fit_into_a_tap():
-    """12 bits hold the weight of a texel, below 0, too; a word's field the sums that weights allow."""
-    assert 2 * UNIT <= 1 << (32 - SHORT_BITS - 1)
+def test_sums_fit_into_a_word():
+    """A field has room for the sums that weights allow."""
     assert (words.BELOW + 384) * UNIT <= 1 << words.FIELD

@@ -8,7 +8,7 @@ import pytest
 
 from rainstereo import Camera, Chamber, Panel, compiled
 from rainstereo.droplet import SphericalCap
-from rainstereo.rain import minified, outlines, paste
+from rainstereo.rain import cells, lookups, minified, outlines, paste
 from rainstereo.rain.compile_ahead import compile_ahead
 from rainstereo.rain.drops import Drops
 from rainstereo.rain.outlines import Outlines
@@ -126,9 +126,18 @@ def test_frames_are_the_same(depth, monkeypatch):
     assert 0 < sum(column.nbytes for column in columns) < 3 * sum(len(table.texels) for table in narrow.tables)
     assert {type(table.texels.taps) for table in narrow.tables} == {WindowTaps, PairTaps}
     expected = wide.apply(image)
-    for kept in (paste.KEPT, 100):
-        monkeypatch.setattr(paste, "KEPT", kept)
-        np.testing.assert_array_equal(dataclasses.replace(narrow).apply(image), expected)
+    monkeypatch.setattr(paste, "SMALL", 0)
+    monkeypatch.setattr(cells, "TOGETHER", 1000)
+    monkeypatch.setattr(lookups, "TILE", 16)
+    bytes_held = sum(table.bytes_of_taps + 2 * len(table.texels) for table in narrow.tables)
+    for held, share in ((paste.HELD, 1.0), (bytes_held // (SIZE[0] * SIZE[1]), 0.5), (0, 0.0)):
+        monkeypatch.setattr(paste, "HELD", held)
+        again = dataclasses.replace(narrow)
+        for _ in range(2):
+            np.testing.assert_array_equal(again.apply(image), expected)
+        if depth == np.uint8 and compiled.available():
+            drawn = again._paste_all
+            assert abs(len(drawn._kept) / len(drawn._all.taps) - share) < 0.1
     for name in ("opacity", "displacement", "unknown"):
         np.testing.assert_array_equal(getattr(narrow, name), getattr(wide, name))
 
@@ -150,11 +159,12 @@ def test_groups_of_a_plan_in_windows(monkeypatch):
 @pytest.mark.parametrize("lasting", [False, True])
 def test_loops_compiled_ahead_are_those_that_draw(lasting, monkeypatch):
     """A plan that comes after has nothing left to compile."""
-    from rainstereo.compiled import far_face, merged_cells, orders, pursuit, quads, ray_steps, sums, windows
+    from rainstereo.compiled import cells as sums
+    from rainstereo.compiled import far_face, merged_cells, orders, pursuit, quads, ray_steps, windows
 
     loops = [pursuit.choose] if lasting else []
     loops += [far_face.look, ray_steps.brought_in, merged_cells.merge]
-    loops += [orders.reorder, sums.interleave, sums.sum_quads, windows.places]
+    loops += [orders.reorder, sums.cut, sums.interleave, sums.draw, windows.places]
     loops += [quads.pack, quads.pack_some, quads.average, quads.halve]
     renderer = Renderer(Camera.pinhole(400, 400, 101, 75, *SIZE), PANE, lasting=lasting)
     compile_ahead.cache_clear()

@@ -1,0 +1,119 @@
+"""Weighted sums of texels, cell by cell (`rain.cells`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .compile import compiled, fused
+from .eights import copy_eight, four_channels, one_channel, three_channels, two_channels
+from .layout import LANES, PLACES
+from .quads import quad_of
+
+U = np.uint64
+EIGHT = U(LANES)
+
+
+@compiled
+def cut(counts: Any, taps: Any, places: Any, clear: Any, seen: Any, pieces: Any, ends: Any) -> Any:
+    """Write which rows are a cell, and which pieces of the row of texels they look at; returns how many cells it are.
+
+    counts: (M,) of taps, M > 0. taps: (T,) texels, in whose stead their places are written; places: (N,) uint32, of
+    each texel. clear: (M,) uint16, not 0 where a row shows what is below, too, which takes a place of its own. seen:
+    (ceil(N / 8),) uint32, 0 at first, of pieces, to work in. pieces: (T,) uint32. ends: (2, M) int64, of each cell, the
+    number of the row after its last, and of the piece.
+    """
+    cell: Any = np.uint32(1)
+    taken, found, tap, begun = U(0), U(0), U(0), U(0)
+    row: Any
+    for row in range(U(len(counts))):
+        end, first = tap + U(counts[row]), found
+        for each in range(tap, end):
+            taps[each] = places[U(taps[each])]
+        while True:
+            for each in range(tap, end):
+                piece = U(taps[each]) // EIGHT
+                if seen[piece] != cell:
+                    seen[piece] = cell
+                    pieces[found] = piece
+                    found += U(1)
+            fresh = EIGHT * (found - first) + U(clear[row] != 0)
+            if taken + fresh <= U(PLACES) or row == begun:
+                break
+            ends[U(0), U(cell) - U(1)], ends[U(1), U(cell) - U(1)] = row, first
+            cell += np.uint32(1)
+            found, taken, begun = first, U(0), row
+        taken += fresh
+        tap = end
+    ends[U(0), U(cell) - U(1)], ends[U(1), U(cell) - U(1)] = len(counts), found
+    return np.int64(cell)
+
+
+@compiled
+def interleave(
+    counts: Any, found: Any, given: Any, number: Any, clear: Any, below: int, most: Any, places: Any, weights: Any
+) -> None:  # fmt: skip
+    """Write the taps of eight rows, in turn, the first of each, the second of each, ...; weights of 0 fill up.
+
+    counts: (M,), found, given: (T,) of rows, places in the row of texels, and weights. number: (n,) uint16, of pieces,
+    the place of the first of the eight in the cell. clear: (M,) uint16, the weight of what is below, if not 0, whose
+    places follow one another, the first being `below`. most: (ceil(M / 8),) the largest number of taps of eight rows, 1
+    at least, by which `places`, uint16, and `weights`, int16, are long. Rows that are missing to eight are as the last.
+    """
+    rows: Any = U(len(counts))
+    tap, first, last = rows - rows, rows - rows, rows - rows
+    place: Any = np.uint16(below)
+    places[:] = 0
+    weights[:] = 0
+    for eight in range(U(len(most))):
+        for lane in range(EIGHT):
+            row = eight * EIGHT + lane
+            if row >= rows:
+                for each in range(U(most[eight])):
+                    places[first + each * EIGHT + lane] = places[first + each * EIGHT + last]
+                    weights[first + each * EIGHT + lane] = weights[first + each * EIGHT + last]
+                continue
+            last = lane
+            for each in range(U(counts[row])):
+                at = U(found[tap])
+                places[first + each * EIGHT + lane] = U(number[at // EIGHT]) + at % EIGHT
+                weights[first + each * EIGHT + lane] = given[tap]
+                tap += U(1)
+            if clear[row]:
+                places[first + U(counts[row]) * EIGHT + lane] = place
+                weights[first + U(counts[row]) * EIGHT + lane] = np.int16(clear[row])
+                place += np.uint16(1)
+        first += U(most[eight]) * EIGHT
+
+
+@fused
+def draw(
+    out: Any, channels: int, row: Any, below: Any, shift: int, near: Any, pieces: Any, soft: Any, pixels: Any,
+    most: Any, places: Any, weights: Any, roundings: Any,
+) -> None:  # fmt: skip
+    """Write the pixels of a cell: sums of bytes times weights.
+
+    out: (P * channels,) uint8, of one to four channels. row: (8 n,) uint32 quads of texels. below: (P, channels)
+    uint8. shift: bits of a weight's unit. near: (`PLACES`,) uint32, to work in. pieces: (n,) uint32 numbers of those of
+    the row that are copied there, one after the other. soft: (S,) uint32 pixels below that follow them.
+    pixels: (M,) uint32, M a multiple of 8. most, places, weights: of `interleave`. roundings: (M,) int16, units of
+    weights, for every channel.
+    """
+    unit, tap, held = np.uint32(shift), U(0), U(0)
+    for i in range(U(len(pieces))):
+        copy_eight(row, EIGHT * U(pieces[i]), near, held)
+        held += EIGHT
+    for i in range(U(len(soft))):
+        near[held + i] = quad_of(below, U(soft[i]))
+    for eight in range(U(len(most))):
+        number, start = eight * EIGHT, tap
+        tap += U(most[eight]) * EIGHT
+        if channels == 1:
+            one_channel(out, near, unit, pixels, number, places, weights, start, tap, roundings)
+        elif channels == 2:
+            two_channels(out, near, unit, pixels, number, places, weights, start, tap, roundings)
+        elif channels == 3:
+            three_channels(out, near, unit, pixels, number, places, weights, start, tap, roundings)
+        else:
+            four_channels(out, near, unit, pixels, number, places, weights, start, tap, roundings)

@@ -1,0 +1,163 @@
+"""Rows of tables in cells: those that look at the same part of the scene, and the texels that they look at.
+
+A frame's texels are too many for the nearest caches, and lie on too many pages of memory. So those of a cell are copied
+side by side, in pieces of eight, before its rows are summed (`compiled.cells`): places among them take 16 bits. Cells
+are filled from all tables together, tile by tile. What is copied, some texels more than once, is a small part of what
+is looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from rainstereo.compiled.layout import BELOW, LANES, PLACES
+
+from .large_pages import numbers
+from .lookups import Lookups
+from .quadtree import UNIT
+
+SHIFT = UNIT.bit_length() - 1
+TOGETHER = 1 << 20  # taps whose rows are put in order at a time
+MOST = PLACES // LANES - 1  # taps of a row: one more for what is below
+BLOCK = 1 << 23  # numbers of 16 bits that are held in one piece of memory
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """What the loop takes, see `compiled.cells.draw`; rows are filled up to a multiple of eight."""
+
+    pieces: Any
+    soft: Any
+    pixels: Any
+    most: Any
+    places: Any
+    weights: Any
+    roundings: Any
+
+    def draw(self, out: Any, row: Any, below: Any, near: Any) -> None:
+        """Write the cell's pixels to `out`, (P, C) uint8. row, below: texels, and pixels where rows are clear in part;
+        near: (`PLACES`,) uint32, to work in."""
+        from rainstereo.compiled.cells import draw
+
+        draw(
+            out.reshape(-1), out.shape[1], row, below, SHIFT, near, self.pieces, self.soft, self.pixels, self.most,
+            self.places, self.weights, self.roundings,
+        )  # fmt: skip
+
+
+class Room:
+    """Memory for many arrays."""
+
+    def __init__(self) -> None:
+        self._left: Any = np.empty(0, dtype=np.uint16)
+
+    def take(self, size: int) -> Any:
+        """(size,) uint16, to be written."""
+        if size > len(self._left):
+            self._left = numbers(np.uint16, max(size, BLOCK))
+        taken, self._left = self._left[:size], self._left[size:]
+        return taken
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """All cells of a frame, in parts that are found together.
+
+    tables: in whose order the M rows are counted. counts, pixels: (M,) of rows; starts: (M,), in its table, of a row's
+    first tap. clear: (M,) uint16 weights of what is below. roundings: (M,) int16, what is added to sums, in 1/`UNIT`.
+    places: (N,) uint32 of each texel in the row of those needed. order: (M,) rows, tile by tile, in each those of as
+    many taps together. parts: where in the order parts begin, and its end.
+    """
+
+    tables: Sequence[Lookups]
+    counts: Any
+    pixels: Any
+    starts: Any
+    clear: Any
+    roundings: Any
+    places: Any
+    order: Any
+    parts: list[int]
+
+    @classmethod
+    def of(cls, tables: Sequence[Lookups], clear: Any, roundings: Any, places: Any, width: int) -> Cells:
+        """roundings: more by `BELOW`. width: of the frame."""
+        tiles = np.concatenate([table.tiles(width) for table in tables])
+        counts = np.concatenate([table.counts for table in tables])
+        pixels = np.concatenate([table.pixels for table in tables])
+        starts = np.concatenate([np.cumsum(table.counts, dtype=np.int64) - table.counts for table in tables])
+        order = np.lexsort((pixels, counts, tiles))
+        others = np.flatnonzero(np.diff(tiles[order])) + 1
+        so_far = np.cumsum(counts[order], dtype=np.int64)
+        begun = others[np.unique(so_far[others - 1] // TOGETHER, return_index=True)[1]]
+        return cls(
+            tables, counts, pixels.view(np.uint32), starts.astype(np.int32), clear,
+            (roundings - np.uint32(BELOW << SHIFT)).astype(np.int16), places, order.astype(np.int32),
+            np.unique([0, *begun.tolist(), len(order)]).tolist(),
+        )  # fmt: skip
+
+    @cached_property
+    def taps(self) -> list[int]:
+        """Of each part."""
+        return [int(self.counts[self.order[a:b]].sum(dtype=np.int64)) for a, b in pairwise(self.parts)]
+
+    def of_part(self, which: int, room: Room) -> Iterator[Cell]:
+        """The cells of a part. room: for their taps."""
+        from rainstereo.compiled.cells import cut
+
+        rows = self.order[self.parts[which] : self.parts[which + 1]]
+        counts, clear = self.counts[rows], self.clear[rows]
+        texels, weights = self._taps(rows, counts)
+        every = int(self.places.max(initial=0)) // LANES + 1
+        seen, number = np.zeros(every, dtype=np.uint32), np.zeros(every, dtype=np.uint16)
+        pieces, ends = np.empty(len(texels), dtype=np.uint32), np.zeros((2, len(rows) + 1), dtype=np.int64)
+        count = cut(counts, texels, self.places, clear, seen, pieces, ends[:, 1:])  # texels are places from here on
+        of_rows, of_pieces = ends[:, : count + 1].tolist()
+        of_taps = np.append(0, np.cumsum(counts, dtype=np.int64))[of_rows].tolist()
+        for some, part, near in zip(pairwise(of_rows), pairwise(of_taps), pairwise(of_pieces), strict=True):
+            own: Any = np.sort(pieces[slice(*near)])
+            yield self._cell(rows[slice(*some)], texels[slice(*part)], weights[slice(*part)], own, number, room)
+
+    def _taps(self, rows: Any, counts: Any) -> tuple[Any, Any]:
+        """Texels and weights of rows, one row after the other."""
+        from rainstereo.compiled.orders import reorder
+
+        starts: Any = self.starts[rows].astype(np.int64)
+        texels, weights, held, begin = [], [], 0, 0
+        for table in self.tables:
+            some = np.flatnonzero((rows >= begin) & (rows < begin + len(table.counts)))
+            if some.size:
+                own = starts[some]
+                first, last = int(own.min()), int((own + counts[some]).max())  # all between, if the table is in order
+                texels.append(table.texels[first:last])
+                weights.append(table.weights[first:last])
+                starts[some] += held - first
+                held += last - first
+            begin += len(table.counts)
+        given = np.concatenate(texels), np.concatenate(weights)
+        found = tuple(np.empty(int(counts.sum(dtype=np.int64)), dtype=of.dtype) for of in given)
+        reorder(np.arange(len(rows)), starts, counts, *given, *found)
+        return found[0], found[1]
+
+    def _cell(self, rows: Any, places: Any, weights: Any, pieces: Any, number: Any, room: Room) -> Cell:
+        """number: of all pieces, to work in."""
+        from rainstereo.compiled.cells import interleave
+
+        counts, clear, pixels = self.counts[rows], self.clear[rows], self.pixels[rows]
+        soft = clear > 0
+        number[pieces] = LANES * np.arange(len(pieces))
+        most = np.maximum.reduceat(np.maximum(counts + soft, 1), np.arange(0, len(counts), LANES))
+        size = LANES * int(most.sum(dtype=np.int64))
+        made = room.take(size), room.take(size).view(np.int16)
+        interleave(counts, places, weights, number, clear, LANES * len(pieces), most, *made)
+        rest = (0, -len(rows) % LANES)
+        return Cell(
+            pieces, pixels[soft], np.pad(pixels, rest, mode="edge"), most.astype(np.uint32), *made,
+            np.pad(self.roundings[rows], rest, mode="edge"),
+        )  # fmt: skip
