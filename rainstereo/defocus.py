@@ -30,6 +30,7 @@ from scipy.spatial import cKDTree
 from . import footprint, types
 from .camera import Camera
 from .chamber import Chamber
+from .covered_patch import strips
 from .droplet import Drop
 from .layer import Layer, depth_of
 from .panel_plane import PanelFrame
@@ -48,9 +49,21 @@ SHARP = 1.0  # pixels; a smaller disc blurs no more than a pixel does
 SAME = 1.1  # ratio of discs up to which one serves all
 CELL = 16  # points along a cell's side that decide how much of it a disc covers
 COARSEST = 8  # pixels of the image averaged, along a side, before samples are taken
-MANY = 1 << 21  # samples whose channels are summed one by one, for memory's sake
 FAINT = 1e-5  # opacity below which there is nothing
 Tracer = Callable[[tuple[slice, slice], float], Patch]
+
+
+@dataclass(frozen=True, eq=False)
+class _Strip:
+    """What is needed of the samples in some rows, to draw frames.
+
+    cells: the rows of cells that are blurred. sums: sparse matrix from sampled colours to the cells' premultiplied
+    means. tables: for each part of the disc the fixed-point maps of the covered samples into the reduced image.
+    """
+
+    cells: slice
+    sums: Any
+    tables: list[tuple[Any, Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,25 +97,24 @@ class DefocusedPatch:
                 f"the image has {image.shape[1]} x {image.shape[0]} pixels; these drops were prepared for images of "
                 f"{self.size[0]} x {self.size[1]}"
             )
-        if self.sharp or not self.patch.opacity.size:
+        if self.sharp or not math.prod(self.patch.shape):
             return self.patch.layer(image, self.border)
         reduced = self._reduced(image)
         colour: Image = np.zeros((*self._shape, *image.shape[2:]), dtype=np.float32)
-        for tables, kernel in zip(self._tables, self._kernels, strict=True):
-            found = cv2.remap(reduced, *tables, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            sampled = found.reshape(found.shape[0] * found.shape[1], -1)
-            if len(sampled) < MANY:
-                sums: Image = self._sums @ sampled.astype(np.float32)
-            else:
-                sums = np.stack([self._sums @ channel.astype(np.float32) for channel in sampled.T], -1)
-            add_blurred(colour, sums.reshape(colour.shape), kernel)
+        sums: Image = np.zeros_like(colour)
+        for part, kernel in enumerate(self._kernels):
+            for strip in self._strips:
+                found = cv2.remap(reduced, *strip.tables[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                sampled = found.reshape(found.shape[0] * found.shape[1], -1)
+                sums[strip.cells] = (strip.sums @ sampled.astype(np.float32)).reshape(-1, *colour.shape[1:])
+            add_blurred(colour, sums, kernel)
         colour[self._coarse_opacity == 0] = 0
         return Layer(*self._window, self._fine(colour), self._opacity)
 
     @property
     def opacity(self) -> tuple[slice, slice, Array]:
         """Rows and columns of the image, and the opacity there: that of every layer, without its colours."""
-        if self.sharp or not self.patch.opacity.size:
+        if self.sharp or not math.prod(self.patch.shape):
             layer = self.patch.layer(np.zeros(self.size[::-1], dtype=np.uint8), self.border)
             return layer.rows, layer.columns, layer.opacity
         return *self._window, self._opacity
@@ -111,13 +123,7 @@ class DefocusedPatch:
 
     def let_go(self) -> None:
         """Give up what was made for frames; if there is another, it is made anew."""
-        for name in ("_sums", "_tables"):
-            self.__dict__.pop(name, None)
-
-    @property
-    def _covered(self) -> types.Indices:
-        """The samples that a drop covers and that are not dark."""
-        return np.flatnonzero(self.patch.gain * self.patch.opacity).astype(np.int32)
+        self.__dict__.pop("_strips", None)
 
     @cached_property
     def _shape(self) -> tuple[int, int]:
@@ -125,43 +131,63 @@ class DefocusedPatch:
         return (rows.stop - rows.start) // self.spacing, (columns.stop - columns.start) // self.spacing
 
     @cached_property
-    def _sums(self) -> Any:
-        """Sparse matrix from sampled colours to the premultiplied means of the cells that are blurred."""
-        columns = self.patch.opacity.shape[1]
-        each = columns // self._shape[1]  # samples along a cell's side
-        covered = self._covered
-        y, x = np.divmod(covered, columns)
-        weight = (self.patch.gain * self.patch.opacity).ravel()[covered] / each**2
-        count = -(-max(1, len(weight)) // ACROSS) * ACROSS
-        cell = y // each * self._shape[1] + x // each
-        return csr_array(
-            (weight, (cell, np.arange(len(weight), dtype=np.int32))), (math.prod(self._shape), count), dtype=np.float32
-        )
-
-    @cached_property
     def _kernels(self) -> list[Array]:
         radius = 0.5 * self.diameter / self.spacing
         return disc_parts(2 * math.sqrt(max(radius**2 - 4 / 3, 0)) if self.spacing > 1 else 2 * radius, self.parts)
 
+    @property
+    def _each(self) -> int:
+        """Samples along the side of a cell."""
+        return self.patch.shape[1] // self._shape[1]
+
     @cached_property
-    def _tables(self) -> list[tuple[Any, Any]]:
-        """For each part of the disc the fixed-point maps of the covered samples into the reduced image."""
-        count = self._sums.shape[1]
-        source: Image = np.zeros((2, count // ACROSS, ACROSS), dtype=np.float32)
-        covered = self._covered
-        source.reshape(2, count)[:, : len(covered)] = self.patch.source.reshape(-1, 2)[covered].T
-        tables = []
-        for kernel in self._kernels:
-            aside = (middle(kernel) * self.spacing * self.shift).astype(np.float32)
-            at = []
-            for along, by, wide, reduced in zip(source, aside, self.size, self._reduced_size, strict=True):
-                found = folded_along(along - by, wide - 1, self.border)
-                found += np.float32(0.5)
-                found *= np.float32(reduced / wide)
-                found -= np.float32(0.5)
-                at.append(np.clip(found, np.float32(0), np.float32(reduced - 1), out=found))
-            tables.append(cv2.convertMaps(at[0], at[1], cv2.CV_16SC2))
-        return tables
+    def _strips(self) -> list[_Strip]:
+        """Those of which a drop covers some, and not darkly."""
+        each = self._each
+        every = list(strips(*self.patch.shape, each))
+        longest = max((rows.stop - rows.start for rows in every), default=0) * self.patch.shape[1]
+        numbers = np.arange(longest, dtype=np.int32)  # which all matrices share
+        found = [self._strip(rows, numbers) for rows in every]
+        return [strip for strip in found if strip is not None]
+
+    def _strip(self, rows: slice, numbers: types.Indices) -> _Strip | None:
+        """What is needed of samples in some rows, whole cells high; None if there are none that show anything.
+
+        Samples are put in the order of their cells, in each from the first row to the last.
+        """
+        each, across = self._each, self._shape[1]
+        cells = slice(rows.start // each, rows.stop // each)
+
+        def by_cell(values: Array) -> Array:
+            return values.reshape(-1, each, across, each).swapaxes(1, 2).reshape(-1, each**2)
+
+        source, gain, opacity = self.patch.strip(rows.start, rows.stop)
+        weight = by_cell(gain * opacity)
+        covered = weight != 0
+        ends = np.cumsum(np.count_nonzero(covered, axis=1), dtype=np.int32)
+        number = int(ends[-1])
+        if not number:
+            return None
+        count = -(-number // ACROSS) * ACROSS
+        sums = csr_array(
+            (weight[covered] / each**2, numbers[:number], np.append(np.int32(0), ends)), (len(weight), count)
+        )
+        at: Image = np.zeros((2, count // ACROSS, ACROSS), dtype=np.float32)
+        for part, along in zip(at, np.moveaxis(source, -1, 0), strict=True):
+            part.reshape(-1)[:number] = by_cell(along)[covered]
+        return _Strip(cells, sums, [self._table(at, kernel) for kernel in self._kernels])
+
+    def _table(self, source: Array, kernel: Array) -> tuple[Any, Any]:
+        """The fixed-point maps of samples, (2, h, w), into the reduced image for a part of the disc."""
+        aside = (middle(kernel) * self.spacing * self.shift).astype(np.float32)
+        at = []
+        for along, by, wide, reduced in zip(source, aside, self.size, self._reduced_size, strict=True):
+            found = folded_along(along - by, wide - 1, self.border)
+            found += np.float32(0.5)
+            found *= np.float32(reduced / wide)
+            found -= np.float32(0.5)
+            at.append(np.clip(found, np.float32(0), np.float32(reduced - 1), out=found))
+        return cv2.convertMaps(at[0], at[1], cv2.CV_16SC2)
 
     @cached_property
     def _reduced_size(self) -> tuple[int, int]:
@@ -169,15 +195,20 @@ class DefocusedPatch:
 
         But where the drop minifies least, by no more than a sixth of the disc.
         """
-        inside = self.patch.opacity * self.patch.gain > 0
-        with_next = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:]
-        source = self.patch.source
-        ux, uy = np.moveaxis((source[:-1, 1:] - source[:-1, :-1])[with_next], -1, 0)
-        vx, vy = np.moveaxis((source[1:, :-1] - source[:-1, :-1])[with_next], -1, 0)
-        apart = np.sqrt(np.abs(ux * vy - uy * vx))
+        apart = np.concatenate([self._apart(rows) for rows in strips(*self.patch.shape)])
         least, usual = np.percentile(apart, (10, 50)) if apart.size else (1.0, 1.0)
         step = int(min(max(min(usual, least * self.diameter * self.patch.density / 6), 1), COARSEST))
         return -(-self.size[0] // step), -(-self.size[1] // step)
+
+    def _apart(self, rows: slice) -> Array:
+        """How far apart samples next to one another look, (N,), of samples in some rows that have two beside them."""
+        source, gain, opacity = self.patch.strip(rows.start, rows.stop + 1)
+        inside = opacity * gain > 0
+        with_next = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:]
+        ux, uy = np.moveaxis((source[:-1, 1:] - source[:-1, :-1])[with_next], -1, 0)
+        vx, vy = np.moveaxis((source[1:, :-1] - source[:-1, :-1])[with_next], -1, 0)
+        found: Array = np.sqrt(np.abs(ux * vy - uy * vx))
+        return found
 
     def _reduced(self, image: Image) -> Image:
         if self._reduced_size == self.size:
@@ -186,9 +217,12 @@ class DefocusedPatch:
 
     @cached_property
     def _coarse_opacity(self) -> Array:
-        covers: Image = self.patch.opacity
-        if covers.shape != self._shape:
-            covers = cv2.resize(covers, self._shape[::-1], interpolation=cv2.INTER_AREA)
+        covers: Image = np.empty(self._shape, dtype=np.float32)
+        each = self._each
+        for rows in strips(*self.patch.shape, each):
+            fine = self.patch.strip(rows.start, rows.stop)[2]
+            cells = covers[rows.start // each : rows.stop // each]
+            cells[...] = cv2.resize(fine, cells.shape[::-1], interpolation=cv2.INTER_AREA) if each > 1 else fine
         opacity: Image = np.zeros(self._shape, dtype=np.float32)
         for kernel in self._kernels:
             add_blurred(opacity, covers, kernel)

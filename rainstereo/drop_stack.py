@@ -21,12 +21,24 @@ STEEPEST = 12.0
 """Slope, against the normal, beyond which a ray beside many drops is not tested against their sides."""
 
 
+@dataclass(frozen=True)
+class Interface:
+    """What rays that meet a drop need to know of its face. Not the face itself, which holds the drops: a ring of
+    references would keep each trace's tables in memory until Python next looks for such rings.
+    """
+
+    side: str
+    n1: float
+    n2: float
+
+
 class Face:
     """A plane interface, from index n1 to n2 at distance z along the normal, and the drops on its air side."""
 
     def __init__(self, z: float, n1: float, n2: float, side: str, origin: Array) -> None:
         self.z, self.n1, self.n2, self.side = z, n1, n2, side
         self.origin = origin  # of the plane's coordinates, in the panel frame
+        self.interface = Interface(side, n1, n2)
         self.drops: dict[int, Drop] = {}  # by their number in the list of all drops
         self.groups: list[CapGroup | SurfaceGroup] = []
         self.grid: DropGrid | None = None
@@ -116,7 +128,7 @@ class CapGroup:
     """All spherical caps on a face: traced together, however many they are."""
 
     def __init__(self, face: Face, caps: dict[int, SphericalCap], total: int) -> None:
-        self.face = face
+        self.face = face.interface
         self.rows = np.full(total + 1, NOBODY)  # row of each drop; the last entry serves NOBODY
         self.rows[list(caps)] = np.arange(len(caps))
         self.columns = CapColumns.of(list(caps.values()), face.origin)
@@ -131,7 +143,7 @@ class CapGroup:
 class CapEncounter:
     """Rays that may meet a spherical cap, and which."""
 
-    face: Face
+    face: Interface
     caps: CapColumns
     near: Approach
 
@@ -162,7 +174,7 @@ class SurfaceGroup:
     """One drop of any other shape; the same steps as `CapGroup`."""
 
     def __init__(self, face: Face, number: int, drop: Drop, total: int) -> None:
-        self.face, self.drop = face, drop
+        self.face, self.drop = face.interface, drop
         self.rows = np.full(total + 1, NOBODY)
         self.rows[number] = 0
         self.centre = face.origin[:2] + np.asarray(drop.centre)
@@ -180,7 +192,7 @@ class SurfaceGroup:
 class SurfaceEncounter:
     """Rays that may meet a drop, and where of it they would cross the face."""
 
-    face: Face
+    face: Interface
     drop: Drop
     x: Array
     y: Array

@@ -140,13 +140,27 @@ class Patch:
 
     # -- using -----------------------------------------------------------------------------------------------------
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of samples, (h', w')."""
+        return sample_shape(self.rows, self.columns, self.density)
+
+    def strip(self, first: int, last: int) -> tuple[Array, Array, Array]:
+        """Source, gain and opacity of the samples' rows from first to before last; not to be changed."""
+        return self.source[first:last], self.gain[first:last], self.opacity[first:last]
+
+    def moved(self, x: int, y: int) -> Patch:
+        """The same in an image that begins so many pixels farther left and up."""
+        rows, columns = (
+            slice(self.rows.start + y, self.rows.stop + y),
+            slice(self.columns.start + x, self.columns.stop + x),
+        )
+        source = self.source + np.array((x, y), dtype=np.float32)
+        return Patch(rows, columns, source, self.gain, self.opacity, self.density)
+
     def unknown(self, size: tuple[int, int]) -> Mask:
         """Samples, (h', w'), that show what an image of `size`, (width, height), does not hold."""
-        width, height = size
-        x, y = self.source[..., 0], self.source[..., 1]
-        inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-        lit: Mask = (self.gain > 0) & (self.opacity > 0)
-        return ~inside & lit
+        return beyond(self.source, self.gain, self.opacity, size)
 
     def layer(self, image: Image, border: str = "mirror") -> Layer:
         """What the drops show of a clear image, premultiplied, at the image's resolution.
@@ -195,6 +209,15 @@ def answers(traced: Trace, clear: Array | float = 1.0) -> tuple[Array, Array, Ar
     return source, gain, covered
 
 
+def beyond(source: Array, gain: Array, opacity: Array, size: tuple[int, int]) -> Mask:
+    """Samples, (...,), that show what an image of `size`, (width, height), does not hold."""
+    width, height = size
+    x, y = source[..., 0], source[..., 1]
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    lit: Mask = (gain > 0) & (opacity > 0)
+    return ~inside & lit
+
+
 def sample_shape(rows: slice, columns: slice, density: float) -> tuple[int, int]:
     """Number of samples, (h', w'), of a window; ValueError unless window and density are sound."""
     for name, part in (("rows", rows), ("columns", columns)):
@@ -228,12 +251,21 @@ def ratio(density: float) -> tuple[int, int]:
 
 def sample_pixels(rows: slice, columns: slice, density: float = 1.0, dtype: npt.DTypeLike = np.float32) -> Array:
     """Pixel coordinates, (h', w', 2), of the samples of a window."""
-    height, width = sample_shape(rows, columns, density)
-    samples, pixels = ratio(density)
-    at = np.empty((height, width, 2), dtype=dtype)
-    at[..., 0] = columns.start + ((np.arange(width) + 0.5) * pixels / samples - 0.5)
-    at[..., 1] = (rows.start + ((np.arange(height) + 0.5) * pixels / samples - 0.5))[:, None]
+    y, x = sample_lines(rows, columns, density)
+    at = np.empty((len(y), len(x), 2), dtype=dtype)
+    at[..., 0] = x
+    at[..., 1] = y[:, None]
     return at
+
+
+def sample_lines(rows: slice, columns: slice, density: float = 1.0) -> tuple[Array, Array]:
+    """The same as rows, (h',), and columns, (w',), in double precision."""
+    samples, pixels = ratio(density)
+    y, x = (
+        part.start + ((np.arange(count) + 0.5) * pixels / samples - 0.5)
+        for part, count in zip((rows, columns), sample_shape(rows, columns, density), strict=True)
+    )
+    return y, x
 
 
 def folded(source: Array, size: tuple[int, int], border: str = "mirror") -> Array:
@@ -336,4 +368,7 @@ def _text(part: slice) -> str:
     return f"{part.start}..{part.stop}"
 
 
-__all__ = ["BORDERS", "Patch", "answers", "folded", "ratio", "resampled", "sample_pixels", "sample_shape"]
+__all__ = [
+    "BORDERS", "Patch", "answers", "beyond", "folded", "ratio", "resampled", "sample_lines", "sample_pixels",
+    "sample_shape",
+]  # fmt: skip

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,10 +11,11 @@ import numpy as np
 
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
+from rainstereo.covered_patch import strips
 from rainstereo.defocus import SAME, DefocusedPatch, apparent_distances, defocused
 from rainstereo.droplet import Drop
 from rainstereo.layer import Layer
-from rainstereo.patch import Patch, resampled, sample_pixels
+from rainstereo.patch import Patch, beyond, ratio, resampled, sample_lines
 from rainstereo.thin_lens import ThinLens
 from rainstereo.types import Array, Image, Mask
 
@@ -70,12 +72,7 @@ class BlurredLayer:
         give_back()
         if shift == (0, 0) and size == camera.size:
             return cls(drops, made, made, shift, kept)
-        x, y = shift
-        rows = slice(made.patch.rows.start + y, made.patch.rows.stop + y)
-        columns = slice(made.patch.columns.start + x, made.patch.columns.stop + x)
-        source = made.patch.source + np.array(shift, dtype=np.float32)
-        moved = replace(made.patch, rows=rows, columns=columns, source=source, kept=None)
-        return cls(drops, made, replace(made, patch=moved, size=size), shift, kept)
+        return cls(drops, made, replace(made, patch=made.patch.moved(*shift), size=size), shift, kept)
 
     def let_go(self) -> None:
         """Give up what was made for frames; if there is another, it is made anew."""
@@ -107,34 +104,55 @@ class BlurredLayer:
         """Rows and columns of the frame, and the opacity there."""
         return self.patch.opacity
 
-    def _fine(self, values: Array) -> Array:
-        """Values of the patch's samples at the pixels of the frame."""
-        patch, (_, cut) = self.patch.patch, self._within
-        height, width = patch.rows.stop - patch.rows.start, patch.columns.stop - patch.columns.start
-        fine = values if patch.density == 1 else resampled(values.astype(np.float32), patch.density, height, width)
-        return fine[cut]
-
     @cached_property
     def displacement(self) -> tuple[slice, slice, Mask, Array]:
         """Of the pinhole's ray: rows, columns, where a drop covers it, and displacements, NaN in dark rims."""
-        patch, (window, _) = self.patch.patch, self._within
-        if not patch.opacity.size:
+        patch, (window, cut) = self.patch.patch, self._within
+        height, width = patch.rows.stop - patch.rows.start, patch.columns.stop - patch.columns.start
+        if not math.prod(patch.shape):
             return *window, np.zeros((0, 0), np.bool_), np.zeros((0, 0, 2), np.float32)
-        lit: Image = ((patch.gain > 0) & (patch.opacity > 0)).astype(np.float32)
-        moved = (patch.source - sample_pixels(patch.rows, patch.columns, patch.density)) * lit[..., None]
-        share, total = self._fine(lit), self._fine(moved)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.where(share[..., None] > 0, total / share[..., None], np.nan)
-        return *window, self._fine(patch.opacity) > 0, mean.astype(np.float32)
+        hidden = np.empty((height, width), np.bool_)
+        mean: Image = np.empty((height, width, 2), np.float32)
+        y, x = (at.astype(np.float32) for at in sample_lines(patch.rows, patch.columns, patch.density))
+        for pixels, rows in self._strips():
+            source, gain, opacity = patch.strip(rows.start, rows.stop)
+            lit: Image = ((gain > 0) & (opacity > 0)).astype(np.float32)
+            moved = source - np.stack(np.broadcast_arrays(x, y[rows, None]), -1)
+            share, total = self._fine(lit, pixels), self._fine(moved * lit[..., None], pixels)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                mean[pixels] = np.where(share[..., None] > 0, total / share[..., None], np.nan)
+            hidden[pixels] = self._fine(opacity, pixels) > 0
+        return *window, hidden[cut], mean[cut]
 
     @cached_property
     def unknown(self) -> tuple[slice, slice, Mask]:
         """Rows, columns, and where the pinhole's ray looks beyond the images that are given."""
-        window, _ = self._within
-        if not self.patch.patch.opacity.size:
+        patch, (window, cut) = self.lookup.patch, self._within
+        height, width = patch.rows.stop - patch.rows.start, patch.columns.stop - patch.columns.start
+        if not math.prod(patch.shape):
             return *window, np.zeros((0, 0), np.bool_)
-        unknown: Image = self.lookup.patch.unknown(self.lookup.size).astype(np.float32)
-        return *window, self._fine(unknown) > 0
+        found = np.empty((height, width), np.bool_)
+        for pixels, rows in self._strips():
+            unknown = beyond(*patch.strip(rows.start, rows.stop), self.lookup.size)
+            found[pixels] = self._fine(unknown.astype(np.float32), pixels) > 0
+        return *window, found[cut]
+
+    def _strips(self) -> Iterator[tuple[slice, slice]]:
+        """Rows of the patch's pixels and of its samples, a strip at a time; all where pixels lie between samples."""
+        patch, height = self.patch.patch, self.patch.patch.rows.stop - self.patch.patch.rows.start
+        samples, pixels = ratio(patch.density)
+        if pixels > 1:
+            yield slice(0, height), slice(0, patch.shape[0])
+            return
+        for rows in strips(*patch.shape, samples):
+            yield slice(rows.start // samples, rows.stop // samples), rows
+
+    def _fine(self, values: Array, pixels: slice) -> Array:
+        """Values of samples at some rows of the patch's pixels."""
+        patch = self.patch.patch
+        if patch.density == 1:
+            return values
+        return resampled(values, patch.density, pixels.stop - pixels.start, patch.columns.stop - patch.columns.start)
 
 
 def nearest(drops: Sequence[Drop], layers: Iterable[BlurredLayer]) -> Traced | None:

@@ -29,6 +29,7 @@ from .blurred import BlurredLayer, by_disc, nearest
 from .cap_tier import OWN, CapTiers, DropTier
 from .drops import Drops
 from .far_caps import are_far_caps
+from .free_memory import give_back
 from .looks import Looks
 from .lookups import Lookups
 from .minified import Batch, Minifier
@@ -334,6 +335,11 @@ class Plan:
         else:
             self._paste(np.ascontiguousarray(image), out)
         return out
+
+    def let_go(self) -> None:
+        """Give up what was made of the tables for frames; if there is another, it is made anew."""
+        if self.__dict__.pop("_paste_all", None) is not None:
+            give_back()
 
     def _paste(self, scene: Image, out: Image) -> None:
         """Put everything over a frame; scene: the clear image, contiguous."""

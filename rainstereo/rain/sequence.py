@@ -63,6 +63,9 @@ class Sequence:
         everyone = tuple(shapes(drops))
         if self._last is not None and self._last.drops == everyone:
             return self._last
+        if self._last is not None:
+            self._last.let_go()  # before memory is needed for the next
+            self._last = None
         sharp, layers = self.renderer.split(everyone, self._layers)
         self._layers = {tuple(layer.drops): layer for layer in layers}
         self._last = Plan(self.renderer, everyone, tuple(self._tables(sharp)), tuple(layers))
@@ -76,12 +79,13 @@ class Sequence:
         fresh = range(self._next, self._next + len(new))
         coming = iter(fresh)
         numbers = {key: self._numbers[key] if key in self._numbers else next(coming) for key in keys}
-        self._numbers, self._next = numbers, fresh.stop
-        known = set(numbers.values())
+        self._numbers = {key: number for key, number in numbers.items() if number < fresh.start}
+        known = set(self._numbers.values())
         kept = [generation.only(known) for generation in self._generations]
-        kept = [generation for generation in kept if generation.groups]
+        self._generations = kept = [generation for generation in kept if generation.groups]  # the others' memory goes
         if new:
-            kept.append(_Generation(frozenset(fresh), self.renderer.lookups(new, fresh)))
+            kept = [*kept, _Generation(frozenset(fresh), self.renderer.lookups(new, fresh))]
+        self._numbers, self._next = numbers, fresh.stop
         if len(kept) > MOST_GENERATIONS:  # the first is the largest, and stays
             late = kept[1:]
             tables = [table for generation in late for table in generation.tables]

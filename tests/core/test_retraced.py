@@ -1,6 +1,8 @@
 """Blurred drops on frame after frame: only what changed is traced, to the bits of a plan from nothing."""
 
 import math
+import subprocess
+import sys
 from collections.abc import Iterable
 
 import numpy as np
@@ -229,3 +231,59 @@ def test_any_sequence_to_the_bits(seed: int, number: float) -> None:
     for _ in range(3):
         np.testing.assert_array_equal(sequence.plan(drops).apply(image), renderer.plan(drops).apply(image))
         drops = [moved(drop, rng.uniform(0, 1e-3)) if rng.random() < 0.4 else drop for drop in drops][rng.integers(2) :]
+
+
+def test_a_plan_that_is_kept_stays_as_it_is() -> None:
+    """Frames after it take its samples over, and leave it alone."""
+    renderer = Renderer(CAMERA, PANE, lens=ThinLens(0.0045, 12.0, 1.0), border=Surround(5, 7, 11, 0))
+    sequence, drops = renderer.sequence(), scattered(6, 6)
+    width, height = renderer.scene_size
+    image = np.resize(photograph(), (height, width, 3))
+    kept, frames, sources = [], [], []
+    for _ in range(3):
+        drops = [moved(drops[0], 2e-4), *drops[1:]]
+        kept.append(sequence.plan(drops))
+        frames.append(kept[-1].apply(image))
+        sources.append(kept[-1].layers[0].patch.patch.source)
+    for plan, frame, source in zip(kept, frames, sources, strict=True):
+        np.testing.assert_array_equal(plan.apply(image), frame)
+        np.testing.assert_array_equal(plan.layers[0].patch.patch.source, source)
+
+
+MEMORY = """
+import re, sys
+from pathlib import Path
+import cv2
+import numpy as np
+from rainstereo import Camera, Chamber, Panel
+from rainstereo.rain.drops import Drops
+from rainstereo.rain.render import Renderer
+from rainstereo.thin_lens import ThinLens
+cv2.setNumThreads(1)
+rng = np.random.default_rng(0)
+count, every = 4000, int(sys.argv[2])
+x, y = rng.uniform(-0.034, 0.034, count), rng.uniform(-0.026, 0.026, count)
+radius, angle = rng.uniform(1e-4, 7e-4, count), rng.uniform(0.3, 1.2, count)
+camera = Camera.pinhole(1200, 1200, 639.5, 479.5, 1280, 960)
+image = rng.integers(0, 256, (960, 1280, 3), dtype=np.uint8)
+lens = ThinLens(0.0045, float(sys.argv[1]), focus=0.6)
+sequence = Renderer(camera, Chamber((0, 0, 1), 0.057, (Panel(0.003, 1.49),)), lens=lens).sequence()
+moving = np.arange(count) % every == 0
+for frame in range(2):
+    plan = sequence.plan(Drops(x + 1e-4 * frame * moving, y, radius, angle))
+    plan.apply(image)
+cover = plan.render(image).drop_mask.mean()
+print(int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024, cover)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory is read from Linux's /proc")
+@pytest.mark.parametrize(("number", "every"), [("16", "1"), ("24", "10")])  # discs of 5 and 3 px: 3 samples a pixel
+def test_blurred_frames_in_bounded_memory(number: str, every: str) -> None:
+    """Two frames' samples, the second's tables and all that is known of its pixels, in the whole process."""
+    told = [sys.executable, "-c", MEMORY, number, every]
+    done = subprocess.run(told, capture_output=True, text=True, check=True, timeout=600)
+    peak, cover = map(float, done.stdout.split())
+    assert cover > 0.6
+    assert peak < 500, f"{peak:.0f} MB"

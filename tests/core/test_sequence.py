@@ -175,3 +175,30 @@ def test_drops_may_come_and_go(frames):
     for frame in frames:
         shown = [drops[i] for i in frame]
         np.testing.assert_array_equal(sequence.plan(shown).apply(image), renderer.plan(shown).apply(image))
+
+
+def test_a_plan_that_is_kept_is_drawn_as_before() -> None:
+    """What it has for drawing is given up for the next one's sake, and made anew if it is needed."""
+    sequence, drops, image = Renderer(CAMERA, PANE).sequence(), scattered(6, 6), photograph()
+    kept = sequence.plan(drops)
+    frame = kept.apply(image)
+    sequence.plan([moved(drops[0], 2e-4), *drops[1:]]).apply(image)
+    assert "_paste_all" not in vars(kept)
+    np.testing.assert_array_equal(kept.apply(image), frame)
+
+
+def test_a_plan_that_failed_costs_no_drop(monkeypatch: pytest.MonkeyPatch) -> None:
+    renderer, drops, image = Renderer(CAMERA, PANE), scattered(6, 6), photograph()
+    sequence = renderer.sequence()
+    sequence.plan(drops)
+    other = [moved(drops[0], 2e-4), *drops[1:]]
+    with monkeypatch.context() as patch:
+
+        def out_of_memory(*_: object) -> None:
+            raise MemoryError
+
+        patch.setattr(Renderer, "lookups", out_of_memory)
+        with pytest.raises(MemoryError):
+            sequence.plan(other)
+    for some in (other, drops):
+        np.testing.assert_array_equal(sequence.plan(some).apply(image), renderer.plan(some).apply(image))

@@ -1,5 +1,6 @@
 """The tracer against an independent reference in 50 digits, Fermat's principle, and its limits."""
 
+import gc
 import math
 from itertools import pairwise
 
@@ -10,6 +11,7 @@ import pytest
 from rainstereo import Camera, Chamber, Panel
 from rainstereo.drop_grid import DropGrid
 from rainstereo.droplet import SphericalCap
+from rainstereo.height_map import HeightMap
 from rainstereo.panel_plane import PanelFrame
 from rainstereo.refraction import backproject, project
 from rainstereo.trace import Fate, Trace, clear_transmittance, trace
@@ -368,3 +370,18 @@ def test_whose_a_ray_is(rng: np.random.Generator, margin: float) -> None:
     found = grid.whose(x, y, slope)
     assert (found >= 0).mean() > 0.3
     np.testing.assert_array_equal(found[~close], expected[~close])
+
+
+def test_tables_of_a_trace_go_with_it() -> None:
+    """Not when Python next looks for rings of references: thousands of drops have tables of megabytes."""
+    caps = [cap(50), cap(40, "near", centre=(1e-3, 0.0)), cap(60, centre=(2e-3, 0.0))]
+    drops = [*caps, HeightMap.of(cap(30, centre=(-3e-3, 0.0)), nodes=17)]
+    pixels = np.stack(np.meshgrid(np.linspace(560, 720, 40), np.linspace(450, 510, 30)), -1)
+    gc.collect()
+    gc.disable()
+    try:
+        t = trace(pixels, drops, CAMERA, pane())
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
+    assert (t.status == Fate.THROUGH).any()
