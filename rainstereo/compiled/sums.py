@@ -59,6 +59,18 @@ def last_two(quad: Any) -> Any:
 
 
 @compiled
+def sum_products(counts: Any, texels: Any, weights: Any, of_texels: Any, total: Any) -> None:
+    """Write sums of weights, (T,) int16, times what is given of texels, (N,) int16, to `total`, (M,) int64."""
+    tap = U(0)
+    for row in range(U(len(total))):
+        end, found = tap + U(counts[row]), np.int64(0)
+        for each in range(tap, end):
+            found += np.int64(weights[each]) * np.int64(of_texels[U(texels[each])])
+        total[row] = found
+        tap = end
+
+
+@compiled
 def sum_numbers(total: Any, values: Any, counts: Any, places: Any, weights: Any) -> None:
     """Write sums of values, (N, C) float32, times weights, (T,) int16, to `total`, (M, C) float32."""
     tap = U(0)

@@ -221,15 +221,24 @@ class Paste:
             np.rint(np.array([c.bias for c in copies(self.size)]) * UNIT), np.diff(copy_starts(self.size))
         ).astype(np.int16)
         found: list[list[Any]] = [[np.zeros(0, dtype=np.uint32)] for _ in self.tables]
-        for piece in (
-            some for whole in self._wholes for some in whole.cut(ROWS // 8)
-        ):  # whole tables take hundreds of MB
+        for piece in (some for whole in self._wholes for some in whole.cut(ROWS)):  # wholes would take much memory
             table, counts = piece.table, piece.table.counts[piece.rows]
-            of_taps = table.weights[piece.taps] * of_copy[table.texels[piece.taps]].astype(np.int64)
-            so_far, ends = np.concatenate([[0], np.cumsum(of_taps)]), np.cumsum(counts)
-            shift = np.clip((so_far[ends] - so_far[ends - counts]) / UNIT**2, -DARKEST, DARKEST)
+            total = _products(counts, table.texels[piece.taps], table.weights[piece.taps], of_copy)
+            shift = np.clip(total / UNIT**2, -DARKEST, DARKEST)
             found[piece.number].append(np.floor((BELOW + 0.5 - shift) * UNIT).astype(np.uint32))
         return [np.concatenate(parts) for parts in found]
+
+
+def _products(counts: Any, texels: Any, weights: Any, of_texels: Any) -> Any:
+    """Sums over rows, (M,) int64, of weights times what is given of texels, (N,) int16."""
+    if compiled.available():
+        from rainstereo.compiled.sums import sum_products
+
+        total: Any = np.empty(len(counts), dtype=np.int64)
+        sum_products(counts, texels, weights, of_texels, total)
+        return total
+    so_far, ends = np.append(0, np.cumsum(weights * of_texels[texels].astype(np.int64))), np.cumsum(counts)
+    return so_far[ends] - so_far[ends - counts]
 
 
 def _as_one(values: Image) -> Any:

@@ -158,8 +158,8 @@ def test_loops_compiled_ahead_are_those_that_draw(lasting, monkeypatch):
 
     loops = [pursuit.choose] if lasting else []
     loops += [far_face.look, ray_steps.brought_in, merged_cells.merge]
-    loops += [orders.reorder, cells.cut, cells.interleave, cells.draw, sums.sum_quads, windows.places]
-    loops += [quads.pack, quads.pack_some, quads.average, quads.halve]
+    loops += [orders.reorder, cells.cut, cells.interleave, cells.draw, sums.sum_quads, sums.sum_products]
+    loops += [windows.places, quads.pack, quads.pack_some, quads.average, quads.halve]
     renderer = Renderer(Camera.pinhole(400, 400, 101, 75, *SIZE), PANE, lasting=lasting)
     compile_ahead.cache_clear()
     compile_ahead(lasting)
