@@ -369,8 +369,8 @@ def check_places(scene: CapScene, caps: Sequence[SphericalCap], columns: tuple[A
     if top.max() >= space:
         for cap in caps:
             cap.check_room(space)
-    ends = ((float(part.min()), float(part.max())) for part in (x, y))
-    bases = [scene.frame.base(chamber, centre, panel, "far") for centre in product(*ends)]
+    corners = product((x.min(), x.max()), (y.min(), y.max()))
+    bases = [scene.frame.base(chamber, (float(a), float(b)), panel, "far") for a, b in corners]
     if not scene.depth > scene.frame.to_camera(np.array(bases))[:, 2].max():
         DropStack(chamber, caps).check_depth(scene.depth)
 
