@@ -10,7 +10,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from itertools import product
+from typing import Any, cast
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -28,6 +29,7 @@ from rainstereo.types import Array, Image, Indices, Mask
 
 from .boxes import Boxes
 from .contacts import touching
+from .drops import Drops
 from .outlines import Outlines
 
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
@@ -111,6 +113,11 @@ class CapScene:
         """Of the far face."""
         return FaceLattice.of(self.camera, self.chamber, self.panel, self.depth)
 
+    @cached_property
+    def frame(self) -> PanelFrame:
+        """The chamber's."""
+        return PanelFrame.of(self.chamber)
+
     def nodes(self, indices: tuple[float, ...]) -> Array:
         """The lattice, and how drops of each index dim."""
         if indices not in self._nodes:
@@ -183,9 +190,24 @@ class CapTable:
     def of(cls, scene: CapScene, caps: Sequence[SphericalCap], outlines: Outlines, groups: Indices) -> CapTable:
         """A table of caps on the scene's face; groups: (N,) numbers kept with them."""
         rows = [(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps]
-        table = np.concatenate([np.array(rows, dtype=np.float64).reshape(-1, 5), groups[:, None]], axis=1)
+        return cls.of_columns(scene, np.array(rows, dtype=np.float64).reshape(-1, 5), outlines, groups)
+
+    @classmethod
+    def of_columns(cls, scene: CapScene, caps: Array, outlines: Outlines, groups: Indices) -> CapTable:
+        """The same, of the first five columns of `caps`."""
+        table = np.concatenate([caps, groups[:, None]], axis=1)
         circles = np.stack([outlines.x, outlines.y, np.minimum(outlines.radius, FAR)], -1)
         return cls._ordered(scene, table, circles)
+
+    @classmethod
+    def of_table(cls, scene: CapScene, drops: Drops) -> CapTable:
+        """Those that the image shows of drops on the scene's face, numbered as they come."""
+        check_places(scene, cast(Sequence[SphericalCap], drops.lazily()), (drops.x, drops.y, drops.top))
+        outlines = Outlines.of_table(drops, scene.camera, scene.chamber, scene.frame)
+        index = np.full(len(drops), drops.index)
+        caps = np.stack([drops.x, drops.y, drops.radius, drops.contact_angle, index], -1)
+        shown = np.flatnonzero(outlines.radius > 0)
+        return cls.of_columns(scene, caps[shown], outlines.take(shown), shown)
 
     @classmethod
     def _ordered(cls, scene: CapScene, caps: Array, circles: Array) -> CapTable:
@@ -337,17 +359,20 @@ class _Tabulated:
     weights: Array
 
 
-def check_places(caps: Sequence[SphericalCap], chamber: Chamber, depth: float) -> None:
-    """ValueError unless the chamber has room for caps on a far face, and the scene lies beyond them."""
-    space = panel_plane.room(chamber, caps[0].panel, "far")
-    if max(cap.top for cap in caps) >= space:
+def check_places(scene: CapScene, caps: Sequence[SphericalCap], columns: tuple[Array, Array, Array]) -> None:
+    """ValueError unless the chamber has room for caps on a far face, and the scene lies beyond them.
+
+    columns: x and y of the caps' centres and their tops; caps themselves are looked at only where something is wrong.
+    """
+    chamber, panel, (x, y, top) = scene.chamber, scene.panel, columns
+    space = panel_plane.room(chamber, panel, "far")
+    if top.max() >= space:
         for cap in caps:
             cap.check_room(space)
-    frame = PanelFrame.of(chamber)
-    low, high = (np.array([bound(cap.centre[i] for cap in caps) for i in (0, 1)]) for bound in (min, max))
-    bases = [frame.base(chamber, (x, y), caps[0].panel, "far") for x in (low[0], high[0]) for y in (low[1], high[1])]
-    if not depth > frame.to_camera(np.array(bases))[:, 2].max():
-        DropStack(chamber, caps).check_depth(depth)
+    corners = product((x.min(), x.max()), (y.min(), y.max()))
+    bases = [scene.frame.base(chamber, (float(a), float(b)), panel, "far") for a, b in corners]
+    if not scene.depth > scene.frame.to_camera(np.array(bases))[:, 2].max():
+        DropStack(chamber, caps).check_depth(scene.depth)
 
 
 def _record(pixels: int, taps: int) -> tuple[Any, ...]:

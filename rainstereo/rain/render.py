@@ -20,6 +20,7 @@ from rainstereo.chamber import Chamber
 from rainstereo.compiled import available
 from rainstereo.droplet import Drop, SphericalCap
 from rainstereo.layer import depth_of
+from rainstereo.panel_plane import room
 from rainstereo.patch import BORDERS
 from rainstereo.thin_lens import ThinLens
 from rainstereo.types import Array, Image, Indices, Mask
@@ -40,6 +41,7 @@ from .paste_moving import PasteMoving
 from .rendered import Rendered
 from .single_ray import SingleRay
 from .streaks import Streak
+from .surround import Surround
 
 if TYPE_CHECKING:
     from . import sequence
@@ -60,21 +62,6 @@ class Group:
     def key(self) -> Key:
         """Equal to that of another group if both look the same."""
         return tuple(self.drops)
-
-
-@dataclass(frozen=True)
-class Surround:
-    """A border of real content: images are given wider than the frame, by so many pixels on each side."""
-
-    left: int = 0
-    top: int = 0
-    right: int = 0
-    bottom: int = 0
-
-    def __post_init__(self) -> None:
-        for side in (self.left, self.top, self.right, self.bottom):
-            if not (isinstance(side, int) and 0 <= side <= 32766):
-                raise ValueError(f"a border of {side} pixels was given; expected a whole number, 0 or more")
 
 
 @dataclass(frozen=True)
@@ -125,6 +112,8 @@ class Renderer:
 
     def plan(self, drops: AnyDrops) -> Plan:
         """Trace drops: one, a table of them, or any mixture of both, in no particular order."""
+        if isinstance(drops, Drops) and (alone := self._of_table(drops)) is not None:
+            return Plan(self, drops.lazily(), alone, ())
         everyone = tuple(shapes(drops))
         sharp, layers = self.split(everyone)
         tables = self._of_caps_alone(self._cap_tiers.drawn(sharp)) if self.moving else None
@@ -188,6 +177,16 @@ class Renderer:
             tables += self._single_ray.tables(self._batches([groups[i] for i in others], given[others]))
         return tables
 
+    def _of_table(self, drops: Drops) -> tuple[CapTable, ...] | None:
+        """The same of a table of sharp ones, without shapes; None also if there are none."""
+        sharp = self.lens is None or math.isinf(self.lens.f_number)
+        if not (self.moving and sharp and len(drops) and drops.face == "far" and drops.index >= 1):
+            return None
+        room(self.chamber, drops.panel, drops.face)
+        scene = self._cap_scene(drops.panel)
+        table = None if scene is None else CapTable.of_table(scene, drops)
+        return table if table is None else (table,) * (len(table.caps) > 0)
+
     def _of_caps_alone(self, drops: Sequence[Drop]) -> tuple[CapTable, ...] | None:
         """The table of caps on one panel's far face, all at once; None if they are not, or compiled loops cannot."""
         if not drops or not all(isinstance(drop, SphericalCap) for drop in drops):
@@ -203,7 +202,8 @@ class Renderer:
         scene = self._cap_scene(caps[0].panel)
         if scene is None or min(cap.index for cap in caps) < 1:
             return None
-        check_places(caps, self.chamber, self.depth)
+        centres = np.array([cap.centre for cap in caps])
+        check_places(scene, caps, (centres[:, 0], centres[:, 1], np.array([cap.top for cap in caps])))
         shown = np.flatnonzero(outlines.radius > 0)
         return CapTable.of(scene, [caps[i] for i in shown], outlines.take(shown), numbers[shown])
 

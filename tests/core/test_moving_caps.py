@@ -391,3 +391,40 @@ def test_small_drops_under_gravity_are_drawn_as_caps_where_the_bound_allows_it()
     weightless = YoungLaplaceDrop((0.0, 0.0), 8e-4, math.radians(60), bond=0.0)
     assert cap_bound(weightless, CAMERA, PANE, DEPTH) < 0.05
     assert Renderer(CAMERA, PANE, DEPTH).plan(drops).tiers[0].bound == 0
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_table_is_planned_as_its_shapes_are(view, monkeypatch):
+    camera, chamber, depth = VIEWS[view]
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(-0.03, 0.03, (2, 40))  # some of them beyond the image
+    drops = Drops(x, y, rng.uniform(2e-4, 2e-3, 40), np.radians(rng.uniform(20, 120, 40)))
+    renderer = Renderer(camera, chamber, depth, moving=True)
+    shapes = drops.shapes()
+    expected = renderer.plan(shapes)
+    with monkeypatch.context() as patch:
+        patch.setattr(Drops, "shapes", lambda self: pytest.fail("a shape was made"))
+        found = renderer.plan(drops)
+        frame = found.apply(photograph())
+    np.testing.assert_array_equal(frame, expected.apply(photograph()))
+    np.testing.assert_array_equal(found.opacity, expected.opacity)
+    assert found.drops == expected.drops == tuple(shapes)
+    assert len(found.drops) == 40
+    assert found.drops[3:5] == tuple(shapes[3:5])
+    assert found.tiers == expected.tiers
+    assert Renderer.from_json(found.render(photograph()).drops_json())[1] == shapes
+
+
+def test_a_table_that_does_not_fit_is_refused_as_its_shapes_are():
+    one = np.zeros(1)
+    drops = Drops(one, one, one + 0.004, one + 1.2)
+    narrow = Chamber((0.0, 0.0, 1.0), 0.057, (Panel(0.003, 1.49), Panel(0.003, 1.49)), (0.002,))
+    for chamber, depth, message in ((narrow, math.inf, "mm tall"), (PANE, 0.02, "depth")):
+        for some in (drops, drops.shapes()):
+            with pytest.raises(ValueError, match=message):
+                Renderer(CAMERA, chamber, depth, moving=True).plan(some)
+    with pytest.raises(ValueError, match="this chamber has 1 panel"):
+        Renderer(CAMERA, PANE, moving=True).plan(Drops(one, one, one + 1e-3, one + 1, panel=2))
+    nothing = Renderer(CAMERA, PANE, moving=True).plan(Drops.none())
+    assert not nothing.tables
+    assert not nothing.drops
