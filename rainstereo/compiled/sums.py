@@ -43,7 +43,8 @@ def sum_quads(
         for channel in range(U(channels)):
             total = low if channel < U(2) else high
             total = total >> HALF if channel & U(1) else total & LOWER
-            out[pixel, channel] = np.uint8(min(max(np.int64(total >> U(shift)) - BELOW, 0), 255))
+            level: Any = np.int64(total >> U(shift)) - BELOW
+            out[pixel, channel] = np.uint8(min(max(level, 0), 255))
 
 
 @fused_part
