@@ -12,10 +12,16 @@ from typing import Any
 
 import numpy as np
 
+LARGE = 1 << 21  # bytes of a page, on most systems that have them
+
 
 def numbers(kind: type, size: int) -> Any:
-    """(size,) numbers of a kind, all 0."""
-    block = mmap.mmap(-1, max(np.dtype(kind).itemsize * size, 1))
+    """(size,) numbers of a kind, all 0. A process that is forked has its own."""
+    length = max(-(-np.dtype(kind).itemsize * size // LARGE), 1) * LARGE
+    if hasattr(mmap, "MAP_PRIVATE"):
+        block = mmap.mmap(-1, length, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    else:
+        block = mmap.mmap(-1, length)
     if hasattr(mmap, "MADV_HUGEPAGE"):
         with contextlib.suppress(OSError):  # a system without them
             block.madvise(mmap.MADV_HUGEPAGE)
