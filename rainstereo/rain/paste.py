@@ -22,6 +22,7 @@ from rainstereo.compiled.layout import BELOW, EVERY, LANES, PACKED, PLACES
 from rainstereo.types import Image
 
 from .cells import MOST, SHIFT, Cell, Cells
+from .free_memory import give_back
 from .large_pages import numbers
 from .lookups import Lookups
 from .pyramid import copies, copy_starts
@@ -194,7 +195,12 @@ class Paste:
     @cached_property
     def _kept(self) -> list[Cell]:
         clear, roundings = np.concatenate(self._clear), np.concatenate(self._roundings)
-        return list(Cells.of(self.tables, clear, roundings, self._places, self.width))
+        every = Cells.of(self.tables, clear, roundings, self._places, self.width)
+        give_back()  # what putting rows in order took, before memory for cells is taken
+        cells = list(every)
+        for name in ("_places", "_roundings"):  # which only other frames need: those of other types than bytes
+            self.__dict__.pop(name, None)
+        return cells
 
     @cached_property
     def _places(self) -> Any:
