@@ -17,7 +17,7 @@ EIGHT = U(LANES)
 
 @compiled
 def cut(counts: Any, taps: Any, places: Any, clear: Any, seen: Any, pieces: Any, ends: Any) -> Any:
-    """Write which rows are a cell, and which pieces of the row of texels they look at; returns how many cells it are.
+    """Write which rows are a cell, and which pieces of the row of texels they look at; returns how many there are.
 
     counts: (M,) of taps, M > 0. taps: (T,) texels, in whose stead their places are written; places: (N,) uint32, of
     each texel. clear: (M,) uint16, not 0 where a row shows what is below, too, which takes a place of its own. seen:

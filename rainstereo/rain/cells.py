@@ -17,7 +17,7 @@ import numpy as np
 
 from rainstereo.compiled.layout import BELOW, LANES, PLACES
 
-from .large_pages import numbers
+from .large_pages import zeros
 from .lookups import Lookups
 from .quadtree import UNIT
 
@@ -50,7 +50,7 @@ class Cell:
         )  # fmt: skip
 
 
-class Room:
+class Arena:
     """Memory for many arrays."""
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class Room:
     def take(self, size: int) -> Any:
         """(size,) uint16, to be written."""
         if size > len(self._left):
-            self._left = numbers(np.uint16, max(size, BLOCK))
+            self._left = zeros(np.uint16, max(size, BLOCK))
         taken, self._left = self._left[:size], self._left[size:]
         return taken
 
@@ -102,11 +102,11 @@ class Cells:
         )  # fmt: skip
 
     def __iter__(self) -> Iterator[Cell]:
-        room = Room()
+        arena = Arena()
         for first, last in pairwise(self.parts):
-            yield from self._of_rows(self.order[first:last], room)
+            yield from self._of_rows(self.order[first:last], arena)
 
-    def _of_rows(self, rows: Any, room: Room) -> Iterator[Cell]:
+    def _of_rows(self, rows: Any, arena: Arena) -> Iterator[Cell]:
         from rainstereo.compiled.cells import cut
 
         counts, clear = self.counts[rows], self.clear[rows]
@@ -119,7 +119,7 @@ class Cells:
         of_taps = np.append(0, np.cumsum(counts, dtype=np.int64))[of_rows].tolist()
         for some, part, near in zip(pairwise(of_rows), pairwise(of_taps), pairwise(of_pieces), strict=True):
             own: Any = np.sort(pieces[slice(*near)])
-            yield self._cell(rows[slice(*some)], texels[slice(*part)], weights[slice(*part)], own, number, room)
+            yield self._cell(rows[slice(*some)], texels[slice(*part)], weights[slice(*part)], own, number, arena)
 
     def _taps(self, rows: Any, counts: Any) -> tuple[Any, Any]:
         """Texels and weights of rows, one row after the other."""
@@ -142,7 +142,7 @@ class Cells:
         reorder(np.arange(len(rows)), starts, counts, *given, *found)
         return found[0], found[1]
 
-    def _cell(self, rows: Any, places: Any, weights: Any, pieces: Any, number: Any, room: Room) -> Cell:
+    def _cell(self, rows: Any, places: Any, weights: Any, pieces: Any, number: Any, arena: Arena) -> Cell:
         """number: of all pieces, to work in."""
         from rainstereo.compiled.cells import interleave
 
@@ -151,7 +151,7 @@ class Cells:
         number[pieces] = LANES * np.arange(len(pieces))
         most = np.maximum.reduceat(np.maximum(counts + soft, 1), np.arange(0, len(counts), LANES))
         size = LANES * int(most.sum(dtype=np.int64))
-        made = room.take(size), room.take(size).view(np.int16)
+        made = arena.take(size), arena.take(size).view(np.int16)
         interleave(counts, places, weights, number, clear, LANES * len(pieces), most, *made)
         rest = (0, -len(rows) % LANES)
         return Cell(

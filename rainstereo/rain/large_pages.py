@@ -15,7 +15,7 @@ import numpy as np
 LARGE = 1 << 21  # bytes of a page, on most systems that have them
 
 
-def numbers(kind: type, size: int) -> Any:
+def zeros(kind: type, size: int) -> Any:
     """(size,) numbers of a kind, all 0. A process that is forked has its own."""
     length = max(-(-np.dtype(kind).itemsize * size // LARGE), 1) * LARGE
     if hasattr(mmap, "MAP_PRIVATE"):

@@ -23,7 +23,7 @@ from rainstereo.types import Image
 
 from .cells import MOST, SHIFT, Cell, Cells
 from .free_memory import give_back
-from .large_pages import numbers
+from .large_pages import zeros
 from .lookups import Lookups
 from .pyramid import copies, copy_starts
 from .quadtree import UNIT
@@ -79,7 +79,7 @@ class Paste:
         self.taps = sum(len(table.texels) for table in self.tables)
         self._matrices: dict[type, list[Any]] = {}
         self._spare: deque[Any] = deque()  # memory for words, of which threads take one each
-        self._again = False
+        self._has_drawn = False
 
     def paste(self, scene: Image, below: Image, out: Image) -> None:
         """Write the pixels of a frame. scene: the clear image. below: the frame's part of it. out: (H, W[, C])."""
@@ -104,10 +104,10 @@ class Paste:
         try:
             row = self._spare.pop()
         except IndexError:
-            row = numbers(np.uint32, PLACES + end + self._needed.fine)
+            row = zeros(np.uint32, PLACES + end + self._needed.fine)
         near, texels, fine = row[:PLACES], row[PLACES : PLACES + end], row[PLACES + end :]
         self._needed.put_quads(scene, texels[: self._needed.ends[-1]], fine)
-        if self._again and self._is_kept:
+        if self._has_drawn and self._is_kept:
             for cell in self._kept:
                 cell.draw(out, texels, below, near)
         else:
@@ -118,7 +118,7 @@ class Paste:
                     piece.table.counts[rows], places, piece.table.weights[piece.taps], clear,
                     self._roundings[piece.number][rows],
                 )  # fmt: skip
-        self._again = True
+        self._has_drawn = True
         self._spare.append(row)
 
     def _words(self, levels: list[Image], below: Image, out: Image, part: slice) -> None:

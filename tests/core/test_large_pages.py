@@ -7,13 +7,13 @@ import sys
 import numpy as np
 import pytest
 
-from rainstereo.rain.large_pages import numbers
+from rainstereo.rain.large_pages import zeros
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32])
 @pytest.mark.parametrize("size", [0, 1, 1000, (1 << 21) + 1])
 def test_numbers_are_0_and_can_be_written(kind, size):
-    found = numbers(kind, size)
+    found = zeros(kind, size)
     assert (found.shape, found.dtype) == ((size,), kind)
     assert not found.any()
     found += kind(7)
@@ -23,8 +23,8 @@ def test_numbers_are_0_and_can_be_written(kind, size):
 FORKED = """
 import os
 import numpy as np
-from rainstereo.rain.large_pages import numbers
-found = numbers(np.uint32, 1000)
+from rainstereo.rain.large_pages import zeros
+found = zeros(np.uint32, 1000)
 child = os.fork()
 if child == 0:
     found[:] = 1
