@@ -96,9 +96,8 @@ class EventLog(SegmentLog):
         super().__init__(path)
         self._writer = writer
 
-    def write(self, event: str, **values: Any) -> None:
-        """Note an event in both."""
-        super().write(event, **values)
+    def _store(self, event: str, values: dict[str, Any], line: bytes) -> None:
+        super()._store(event, values, line)
         self._writer.event(f"pump {event}", **values)
 
 
@@ -154,6 +153,10 @@ def take(options: Options, out: Path, cameras: CameraPair, pump: Pump | None, pl
         preview = Preview(out / "preview.jpg", options.preview_s)
         with Live(Text("recording"), console=console, transient=True, refresh_per_second=4) as live:
             outcome = session(cameras, writer, until, player, preview, lambda line: live.update(Text(line)))
+        try:
+            pump_log.close()
+        except OSError as error:
+            outcome.failed, outcome.reason = True, f"{outcome.reason}; the pump's log could not be written ({error})"
         found = results(outcome, writer)
         writer.close(**{key: value for key, value in found.items() if key not in ("dry", "wet", "sync")})
         if writer.error is not None and not outcome.failed:

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from rainstereo.hardware.firmware import SimulatedPump
+from rainstereo.hardware.player import Player
 from rainstereo.hardware.pump import LeaseExpiredError, Pump, PumpError
-from rainstereo.hardware.regime import Segment
+from rainstereo.hardware.pump_log import SegmentLog, read
+from rainstereo.hardware.regime import Regime, Segment
+from rainstereo.hardware.schedule import Schedule, Step
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -130,3 +133,32 @@ def test_a_fault_is_told_to_the_caller(device: SimulatedPump) -> None:
                 pump.renew()
                 time.sleep(0.02)
         assert [event.name for _, event in pump.events] == ["LV"]
+
+
+def test_a_slow_disk_neither_ends_a_run_nor_delays_its_stop(
+    device: SimulatedPump, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sync of the log takes longer than the watchdog waits."""
+    synced: list[float] = []
+
+    def slow(_: int) -> None:
+        time.sleep(1.5)
+        synced.append(time.monotonic())
+
+    monkeypatch.setattr("os.fsync", slow)
+    plan = Schedule((Step(Regime("pulses", (Segment(900, 60_000, 100, 100),))),)).expand()
+    with SegmentLog(tmp_path / "segments.jsonl") as log, Pump.open(device.port) as pump:
+        player = Player(pump, plan, log)
+        until = time.monotonic() + 2.5
+        while time.monotonic() < until:
+            player.poll()
+            assert pump.status().state == "run"
+            time.sleep(0.05)
+        begun = time.monotonic()
+        player.stop("asked")
+        assert time.monotonic() - begun < 1.0
+    assert device.wait(0).fault == 0
+    assert len(synced) >= 2
+    events = [entry["event"] for entry in read(tmp_path / "segments.jsonl")]
+    assert events[0] == "armed"
+    assert events[-1] == "stop"

@@ -1,6 +1,8 @@
 """Segments, regimes and schedules: what is refused, and that a seed decides everything else."""
 
+import errno
 import math
+import time
 from pathlib import Path
 
 import pytest
@@ -177,6 +179,29 @@ def test_the_log_survives_a_half_line(tmp_path: Path) -> None:
             log.write("bad", value=math.nan)
     assert [entry["event"] for entry in read(path)] == ["segment", "stop"]
     assert read(path)[0]["regime"] == "mist"
+
+
+def test_a_full_disk_is_told_to_who_writes_next_and_to_who_closes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    log = SegmentLog(tmp_path / "log.jsonl")
+    log.write("segment")
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    until = time.monotonic() + 20
+    with pytest.raises(OSError, match="no space left"):
+        while time.monotonic() < until:  # the log's own thread meets it first
+            log.write("segment")
+            time.sleep(0.001)
+    with pytest.raises(OSError, match="no space left"):
+        log.close()
+    log.close()
+    with pytest.raises(ValueError, match="closed"):
+        log.write("segment")
+    assert {entry["event"] for entry in read(log.path)} == {"segment"}
 
 
 def test_missing_firmware_is_said_clearly(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
