@@ -192,7 +192,7 @@ def test_a_full_disk_is_told_to_who_writes_next_and_to_who_closes(
 
     monkeypatch.setattr("os.fsync", full)
     until = time.monotonic() + 20
-    with pytest.raises(OSError, match="no space left"):
+    with pytest.raises(OSError, match="no space left"):  # noqa: PT012
         while time.monotonic() < until:  # the log's own thread meets it first
             log.write("segment")
             time.sleep(0.001)
