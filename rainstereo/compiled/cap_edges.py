@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .cap_looks import BIAS, ONE_, SMALLEST, folded, pixel_value
+from .cap_looks import BIAS, folded, pixel_value
 from .cap_rays import (
     CAP_CURVATURE,
     CAP_DEPTH,
@@ -45,7 +45,7 @@ from .cap_rays import (
     cross,
 )
 from .cap_shares import contact_share, from_rival
-from .cap_tiles import LITS, WHOLE
+from .cap_tiles import LITS, SMALLEST, WHOLE
 from .cap_vectors import above_zero, lanes_from, lowest, sum_of_16, weighed
 from .compile import fused, fused_part
 from .prefetch import to_read
@@ -301,7 +301,7 @@ def own_of_row(
     left = lanes_from(above_zero(rays, MARK), low, high)
     while left:
         j = lowest(left)
-        left &= left - ONE_
+        left &= left - np.uint64(1)
         lane, rival = np.int64(j), np.int64(rays[RIVAL + j]) - 1
         form, at_s = form_of(u + lane, v, outlines[number], tiny, rival), s + np.float32(lane)
         before, pixel = rays[HIDDEN + j], ((v * width + u) + lane) * scene.shape[2]

@@ -21,7 +21,8 @@ from .cap_edges import (
     slopes_of_row,
     trace_own,
 )
-from .cap_looks import ROUND, is_whole, whole_of_words
+from .cap_looks import is_whole, show_alone
+from .cap_patches import PLACES, call_whole, show_whole, whole_of_row
 from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
 from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
@@ -35,6 +36,7 @@ from .cap_tiles import (
     FAR,
     OUT_RADIUS,
     OUT_RIVALS,
+    SIZE,
     TILE,
     TINY,
     bounds,
@@ -45,17 +47,17 @@ from .cap_tiles import (
     row_of_tile,
     widest,
 )  # fmt: skip
-from .cap_vectors import thrice
+from .cap_vectors import above, lowest, thrice
 from .compile import fused, fused_part
 from .layout import DRAW, FILL
 from .prefetch import to_write
 
-EIGHT = np.uint64(8)
+EIGHT, NONE, ONE_LANE = np.uint64(8), np.uint64(0), np.uint64(1)
 
 
 @fused
 def frame(
-    mode: Any, out: Any, size: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, looks: Any,
+    mode: Any, out: Any, size: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, bands: Any,
     nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
     record: Any, desk: Any,
 ) -> None:  # fmt: skip
@@ -64,16 +66,14 @@ def frame(
     mode: DRAW: into `out`, (H W C,) of up to three channels of bytes, which holds the clear image, from boxes of the
     scene in `words`. COUNT: how many pixels and taps there are, to record's counters. FILL: write them to record.
     scene: (h, w, C) bytes; only its size matters unless drawing. boxes: starts, widths, inverse distances (`boxes`).
-    border, shift: how the scene goes on, and where the frame is in it. looks: grids, how many looks each has, how many
-    of the first look at four boxes each, and bands of areas (`cap_tiles`).
+    border, shift: how the scene goes on, and where the frame is in it. bands: of patches' areas (`cap_tiles`).
     nodes, caps, ...: see `cap_rays`, `cap_tiles`.
     record: pixels, caps' numbers, taps a pixel, clear shares, displacements, unknown; texels, weights; counters.
     """
     starts, pitches, inverses = boxes
-    grids, counts, fines, bands = looks
     width, height = size
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
-    rays, line, tile, slopes, total, at, quarters, slots, beams, pixels, hidden = desk
+    rays, line, tile, slopes, total, at, beams, pixels, hidden, places, parts = desk
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
@@ -108,7 +108,7 @@ def frame(
                         tile, t, s, not known, (low, high), following, cap, later, view, line, rays
                     )  # fmt: skip
                     known = low < high
-                    patches(rays, begin, end, bands, shift, last)
+                    patches(rays, begin, end, bands, len(starts), shift, last)
                     shares_of_row(tile, t, s, lanes, low, high, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
                         taken(tile, t, s, u1, v, lanes, wide, caps, number, rivals, outlines, line, rays)
@@ -119,21 +119,27 @@ def frame(
                         record_row(
                             mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, edge, caps,
                             outlines, later, view, line, slopes, (scene.shape[1], scene.shape[0]), starts, pitches,
-                            inverses, border, shift, grids, counts, fines, rays, at, quarters, total, len(words), width,
-                            record,
+                            inverses, border, shift, rays, at, total, len(words), width, record,
                         )  # fmt: skip
                         continue
                     for j in range(np.uint64(3 * 64)):
                         rays[SHOWN + j] = ZERO
-                    if not tiny:
-                        whole_of_words(
-                            words, scene, starts, pitches, inverses, last, border, grids, counts, fines, begin, end,
-                            rays, total, at, quarters, slots,
-                        )  # fmt: skip
+                    every, fine = whole_of_row(begin, end, rays)
+                    if tiny:
+                        every = fine = NONE
+                    alone = every & ~above(rays, SIZE, -HALF)
+                    every, fine = every & ~alone, fine & ~alone
+                    if every:
+                        call_whole(every, fine, words, starts, last, border, bands, rays, places, parts)
                     made = own_of_row(
                         words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
                         later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden, total, width, out,
                     )  # fmt: skip
+                    if every:
+                        show_whole(every, fine, words, starts, last, bands, rays, places, parts)
+                    while alone:
+                        show_alone(scene, last, border, rays, lowest(alone), total)
+                        alone &= alone - ONE_LANE
                     write_bytes(out, width, scene.shape[2], v, u1, lanes, rays)
         if made > 0:
             draw_own(
@@ -146,8 +152,8 @@ def frame(
 def record_row(
     filling: bool, u: Any, v: Any, number: Any, lanes: Any, low: Any, high: Any, begin: Any, end: Any, tiny: bool,
     hangs: bool, s: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
-    line: Any, slopes: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any, grids: Any,
-    counts: Any, fines: Any, rays: Any, at: Any, quarters: Any, mean: Any, boxes: Any, width: Any, record: Any,
+    line: Any, slopes: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any,
+    rays: Any, at: Any, mean: Any, boxes: Any, width: Any, record: Any,
 ) -> None:  # fmt: skip
     """Count, or write down, a row's pixels. u, v: column of lane 0, and row. boxes: how many there are."""
     pixels, of_caps, taps, clear, moved, unknown, texels, weights, cursor = record
@@ -160,8 +166,7 @@ def record_row(
         mean[:] = ZERO
         if begin <= lane < end and is_whole(rays, j) and not tiny:
             record_whole(
-                starts, pitches, inverses, size, border, grids, counts, fines, rays, lane, boxes, at, quarters, texels,
-                weights, cursor, filling,
+                starts, pitches, inverses, size, border, rays, lane, boxes, texels, weights, cursor, filling,
             )  # fmt: skip
             bend = np.float32(1 / 24)
             mean[0] = rays[CX + j] - shift[0] + (rays[AXX + j] + rays[BXX + j]) * bend
@@ -199,9 +204,9 @@ def desk() -> tuple[Any, ...]:
     """Room for what `frame` works on."""
     return (
         np.zeros(PLANES * 64, np.float32), np.zeros(15, np.float32), np.zeros((5, 3, 3), np.float32),
-        np.zeros(12, np.float32), np.zeros(4, np.float32), np.zeros(ROUND * 64, np.uint32),
-        np.zeros(ROUND * 64, np.uint32), np.zeros((3, ROUND), np.int64), np.zeros(PLANES * 64, np.float32),
+        np.zeros(12, np.float32), np.zeros(4, np.float32), np.zeros(64, np.uint32), np.zeros(PLANES * 64, np.float32),
         np.zeros(TOGETHER, np.int64), np.zeros(TOGETHER, np.float32),
+        np.zeros(PLACES, np.uint32), np.zeros(PLACES, np.uint32),
     )  # fmt: skip
 
 

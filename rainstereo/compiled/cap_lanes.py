@@ -72,9 +72,20 @@ class Lanes:
 
     def root(self) -> Lanes:
         """The square root; NaN of what is negative."""
+        return self._each("sqrt")
+
+    def _each(self, name: str) -> Lanes:
         kind = ir.FunctionType(REALS, [REALS])
-        call = declared(self.builder.module, kind, f"llvm.sqrt.v{WIDE}f32")
+        call = declared(self.builder.module, kind, f"llvm.{name}.v{WIDE}f32")
         return Lanes(self.builder, self.builder.call(call, [self.value]))
+
+    def size(self) -> Lanes:
+        """Without their signs."""
+        return self._each("fabs")
+
+    def floor(self) -> Lanes:
+        """Rounded down."""
+        return self._each("floor")
 
     def above(self, other: Number) -> Any:
         """Which lanes are, to choose by."""

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from .cap_edges import LANES, NO_BOX, SIZE_BITS
-from .cap_looks import INSIDE, OF_GRID, look_at, places, sides, size_of
+from .cap_looks import INSIDE, look_at, look_at_box, sides
 from .cap_rays import HIDDEN, ONE, SUB, WEIGHT, Y_, ZERO
-from .cap_tiles import FAR, GAINS, GRID, PART
+from .cap_tiles import ACROSS, DOWN, FAR, GAINS, KIND, SIZE
 from .compile import fused, fused_part
 
 PIXELS, TAPS = 0, 1  # counters
@@ -39,37 +39,35 @@ def _bilinear(
 
 @fused
 def record_whole(
-    starts: Any, pitches: Any, inverses: Any, size: Any, border: Any, grids: Any, counts: Any, fines: Any, rays: Any,
-    lane: Any, first: Any, at: Any, parts: Any, texels: Any, weights: Any, cursor: Any, filling: bool,
+    starts: Any, pitches: Any, inverses: Any, size: Any, border: Any, rays: Any, lane: Any, first: Any, texels: Any,
+    weights: Any, cursor: Any, filling: bool,
 ) -> None:  # fmt: skip
     """The taps of a pixel all of whose rays are lit. first: number of the image's first pixel among the texels."""
-    j, begin = np.uint64(lane), np.uint64(0)
+    j = np.uint64(lane)
     last = np.float32(size[0] - 1), np.float32(size[1] - 1)
-    k, grid = size_of(rays[PART + j], len(inverses)), np.uint64(rays[GRID + j])
     gain = rays[GAINS + j] * rays[HIDDEN + j]
-    if k < 0:
+    if rays[SIZE + j] < ZERO:
         across, down = sides(rays, j)
         for b in range(down):
             for a in range(across):
                 x, y = look_at(rays, j, a, b, across, down, last, border)
                 _bilinear(texels, weights, cursor, filling, first, size, x, y, gain / np.float32(across * down))
         return
-    start, pitch, inverse, count = starts[k], pitches[k], inverses[k], counts[grid]
-    room = (count + 7) // 8 * 8
-    on, part = border if not rays[FAR + j] >= ZERO else INSIDE, gain / np.float32(count)
-    if grid < np.uint64(fines):
-        places(True, start, pitch, inverse, last, on, rays, j, grids, grid * OF_GRID, room, at, begin, parts)
-        for look in range(np.uint64(count)):
-            box, far = np.int64(at[look]), np.int64(parts[look])
-            u, v = np.float32(far & 3) / np.float32(4), np.float32(far >> 2) / np.float32(4)
-            _tap(texels, weights, cursor, filling, box, part * (ONE - v) * (ONE - u))
-            _tap(texels, weights, cursor, filling, box + 1, part * (ONE - v) * u)
-            _tap(texels, weights, cursor, filling, box + pitch, part * v * (ONE - u))
-            _tap(texels, weights, cursor, filling, box + pitch + 1, part * v * u)
-        return
-    places(False, start, pitch, inverse, last, on, rays, j, grids, grid * OF_GRID, room, at, begin, parts)
-    for look in range(np.uint64(count)):
-        _tap(texels, weights, cursor, filling, np.int64(at[look]), part)
+    k = np.uint64(np.int64(rays[SIZE + j]))
+    start, pitch, inverse = starts[k], pitches[k], inverses[k]
+    on, part = border if not rays[FAR + j] >= ZERO else INSIDE, gain / (rays[ACROSS + j] * rays[DOWN + j])
+    for b in range(np.int64(rays[DOWN + j])):
+        for a in range(np.int64(rays[ACROSS + j])):
+            if rays[KIND + j] == ZERO:
+                box, right, low = look_at_box(True, start, pitch, inverse, last, on, rays, j, a, b)
+                u, v = np.float32(right) / np.float32(4), np.float32(low) / np.float32(4)
+                _tap(texels, weights, cursor, filling, box, part * (ONE - v) * (ONE - u))
+                _tap(texels, weights, cursor, filling, box + 1, part * (ONE - v) * u)
+                _tap(texels, weights, cursor, filling, box + pitch, part * v * (ONE - u))
+                _tap(texels, weights, cursor, filling, box + pitch + 1, part * v * u)
+            else:
+                box, _, _ = look_at_box(False, start, pitch, inverse, last, on, rays, j, a, b)
+                _tap(texels, weights, cursor, filling, box, part)
 
 
 @fused

@@ -48,17 +48,17 @@ OUT_X, OUT_Y, OUT_RADIUS, OUT_RIVAL, OUT_RIVALS = range(5)
 """Columns of a table of outlines, float64: a circle in the image, and which of the list of rivals are the cap's."""
 WHOLE, PARTLY = np.float32(2), np.float32(1)
 """Of a pixel's rays beside it, whether all or only some are lit."""
-CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, PART, GRID, FAR, LITS, EIGHTS = (
-    PATCH + np.uint64(64 * i) for i in range(18)
+CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, SIZE, ACROSS, DOWN, KIND, FAR, LITS = (
+    PATCH + np.uint64(64 * i) for i in range(19)
 )  # fmt: skip
 """Planes of patches: the middle of what a pixel shows; how places change along x (A) and y (B), twice along each, and
-along both; mean gain; area, square pixels, that one look stands for; the number of the grid of looks; pixels between
-what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0; how many eights of looks it has, or `OTHER`."""
-AREAS, AIMS, FIRSTS, PARTS, ROOMS = range(5)
-"""Columns of a table of bands: up to which area of a patch, how many looks it gets, from which grid on, and
-which part of the patch's area a box has; eights of looks, or `OTHER`."""
-OTHER = np.float32(6)
-"""In place of how many eights of looks: for looks at four boxes each, and for those that may fall beyond the scene."""
+along both; mean gain; the size of boxes, -1: the image itself; looks across and down; 0 in the first band; pixels
+between what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0."""
+AREAS, AIMS, PARTS = range(3)
+"""Columns of a table of two bands: up to which area of a patch, how many looks it gets, and which part of the patch's
+area a box has. Looks of the first are at four boxes each."""
+SMALLEST = np.float32(math.sqrt(2) / 16)
+"""1 / the square of the side up to which boxes are the smallest: a quarter octave above their own."""
 LARGEST = np.float32(110 * 110)
 """Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
 LARGEST_ALONE = np.float32(64 * 64)
@@ -206,17 +206,15 @@ def reach(ax: Any, bx: Any, axx: Any, bxx: Any, mixed: Any) -> Any:
 
 
 @fused_part
-def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -> None:
+def patches(rays: Any, low: Any, high: Any, bands: Any, sizes: Any, shift: Any, last: Any) -> None:
     """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel.
 
-    bands: (4, 5), see `AREAS`.
+    bands: (2, 3), see `AREAS`. sizes: of boxes that there are.
     """
     dx, dy, end_x, end_y = shift[0], shift[1], last[0], last[1]
-    area1, area2, area3 = bands[0, AREAS], bands[1, AREAS], bands[2, AREAS]
-    aim0, aim1, aim2, aim3 = bands[0, AIMS], bands[1, AIMS], bands[2, AIMS], bands[3, AIMS]
-    first0, first1, first2, first3 = bands[0, FIRSTS], bands[1, FIRSTS], bands[2, FIRSTS], bands[3, FIRSTS]
-    part0, part1, part2, part3 = bands[0, PARTS], bands[1, PARTS], bands[2, PARTS], bands[3, PARTS]
-    room0, room1, room2, room3 = bands[0, ROOMS], bands[1, ROOMS], bands[2, ROOMS], bands[3, ROOMS]
+    small_area, aim0, aim1 = bands[0, AREAS], bands[0, AIMS], bands[1, AIMS]
+    part0, part1 = bands[0, PARTS], bands[1, PARTS]
+    largest, nought, below = np.int32(sizes - 1), np.int32(0), np.int32(-1)
     one, tiny, small, two, twelfth = (
         np.uint64(1),
         np.float32(1e-20),
@@ -234,7 +232,8 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -
         per = twelfth / gain  # what is brighter counts more: it is as if the middle lay there
         cx, ax, bx, axx, bxx, mixed = bent(rays, j, known, steep)
         cx += dx + (ag * ax + bg * bx) * per
-        p, q = cx - reach(ax, bx, axx, bxx, mixed), end_x - cx - reach(ax, bx, axx, bxx, mixed)
+        out = reach(ax, bx, axx, bxx, mixed)
+        p, q, over = cx - out, end_x - cx - out, out - end_x
         far = p if p < q else q
         rays[CX + j] = cx
         rays[AX + j] = ax
@@ -244,7 +243,9 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -
         rays[ABX + j] = mixed
         cy, ay, by, ayy, byy, mixed = bent(rays, Y_ + j, known, steep)
         cy += dy + (ag * ay + bg * by) * per
-        p, q = cy - reach(ay, by, ayy, byy, mixed), end_y - cy - reach(ay, by, ayy, byy, mixed)
+        out = reach(ay, by, ayy, byy, mixed)
+        p, q = cy - out, end_y - cy - out
+        over = over if over > out - end_y else out - end_y
         p = p if p < q else q
         rays[CY + j] = cy
         rays[AY + j] = ay
@@ -255,19 +256,22 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, shift: Any, last: Any) -
         far = far if far < p else p
         rays[FAR + j] = far
         area = abs(ax * by - ay * bx)
-        aim, first, part = (aim0, first0, part0) if area < area1 else (aim1, first1, part1)
-        aim, first, part = (aim, first, part) if area < area2 else (aim2, first2, part2)
-        aim, first, part = (aim, first, part) if area < area3 else (aim3, first3, part3)
-        room = room0 if area < area1 else room1
-        room = room if area < area2 else room2
-        room = room if area < area3 else room3
-        rays[EIGHTS + j] = room if far >= ZERO else OTHER
-        rays[PART + j] = area * part
-        rays[LITS + j] = rays[LITS + j] if area < (LARGEST if known else LARGEST_ALONE) else PARTLY
+        aim, part, kind = (aim0, part0, ZERO) if area < small_area else (aim1, part1, np.float32(1))
+        rays[KIND + j] = kind
+        octaves = (np.float32(area * part * SMALLEST).view(np.int32) >> np.int32(23)) - np.int32(127)
+        size = octaves if octaves > nought else nought
+        size = size if size < largest else largest
+        rays[SIZE + j] = np.float32(size if octaves >= below else below)
+        most = LARGEST if known else LARGEST_ALONE
+        most = most if over < ZERO else ZERO  # wider than the scene: folded more than once
+        rays[LITS + j] = rays[LITS + j] if area < most else PARTLY
         ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))
         across = np.float32(math.sqrt(aim * np.float32(math.sqrt(ratio)))) + HALF
         across = across if across < HALF * aim else HALF * aim
-        rays[GRID + j] = first + (across if across > two else two)
+        across = np.float32(np.int32(across if across > two else two))
+        down = np.float32(np.int32(aim / across))
+        rays[ACROSS + j] = across
+        rays[DOWN + j] = down if down > two else two
 
 
 @fused_part

@@ -142,53 +142,12 @@ def _weighed(_context: Any, words: Any, at: Any, _first: Any, rays: Any, _weight
     return four(words, at, types.uint64, rays, types.uint64), code
 
 
-@intrinsic
-def _sum_of_words(_context: Any, words: Any, at: Any, _first: Any, _count: Any, _room: Any) -> Any:
-    """sum_of_words(words, at, first, count, room): of up to 64 words, as if each had been spread (`boxes.spread`).
-
-    at: their numbers, from `first` on, up to a number `room` of them, a multiple of 8; those after `count` are any
-    words'.
-    """
-
-    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        texels, numbers, first, count, room = arguments(context, builder, signature, given)
-        outer = FIELD | FIELD << 2 * BITS
-        before, loop, after = builder.block, builder.append_basic_block("eight"), builder.append_basic_block("sum")
-        limit = spread(builder, builder.trunc(count, FOUR), WORDS)
-        builder.branch(loop)
-        builder.position_at_end(loop)
-        done, lanes = builder.phi(LONG), builder.phi(WORDS)
-        sums = [builder.phi(WORDS) for _ in range(2)]
-        found = _gathered(builder, texels, numbers, builder.add(first, done))
-        found = builder.select(builder.icmp_unsigned("<", lanes, limit), found, _words(0))
-        parts = (
-            builder.and_(found, _words(outer)),
-            builder.and_(builder.lshr(found, _words(BITS)), _words(FIELD)),
-        )
-        added = [builder.add(old, one) for old, one in zip(sums, parts, strict=True)]
-        further, next_lanes = builder.add(done, LONG(WIDE)), builder.add(lanes, _words(WIDE))
-        builder.cbranch(builder.icmp_unsigned("<", further, room), loop, after)
-        starts = LONG(0), ir.Constant(WORDS, list(range(WIDE))), _words(0), _words(0)
-        for phi, start, new in zip((done, lanes, *sums), starts, (further, next_lanes, *added), strict=True):
-            phi.add_incoming(start, before)
-            phi.add_incoming(new, loop)
-        builder.position_at_end(after)  # the last channel may have 12 bits: its sum is not folded beside the first's
-        first_middle = builder.or_(builder.and_(added[0], _words((1 << 16) - 1)), builder.shl(added[1], _words(16)))
-        last = builder.zext(folded(builder, builder.lshr(added[0], _words(2 * BITS)), builder.add, WIDE), LONG)
-        both = builder.zext(folded(builder, first_middle, builder.add, WIDE), LONG)
-        low, middle = builder.and_(both, LONG((1 << 16) - 1)), builder.lshr(both, LONG(16))
-        return builder.or_(low, builder.or_(builder.shl(last, LONG(20)), builder.shl(middle, LONG(40))))
-
-    return types.uint64(words, at, types.uint64, types.uint64, types.uint64), code
-
-
 above: Any = _above
 lowest: Any = _lowest
 highest: Any = _highest
 thrice: Any = _thrice
 sum_of_16: Any = _sum_of_16
 weighed: Any = _weighed
-sum_of_words: Any = _sum_of_words
 
 
 @fused_part

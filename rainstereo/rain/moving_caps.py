@@ -35,14 +35,13 @@ from .outlines import Outlines
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE = (20.0, 8), (24.0, 12), (64.0, 24), (math.inf, 40)
-COARSE = (16.0, 4), (40.0, 4), (80.0, 6), (math.inf, 9)
+FINE = (20.0, 8), (math.inf, 25)
+COARSE = (16.0, 4), (math.inf, 6)
 """Square root of the area, pixels, up to which what a pixel shows gets how many looks, the first of them at four boxes
 each."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
-WIDER = 1.4, 1.25, 1.25, 1.25
+WIDER = 1.4, 1.25
 """Area of a box over that of its part of what a pixel shows: a little overlap is best."""
-LANES = 64
 FEW = 400  # caps, up to which all pairs are compared
 
 
@@ -141,24 +140,12 @@ class CapScene:
         return COARSE if self.tolerance >= COARSE_FROM else FINE
 
     @cached_property
-    def looks(self) -> tuple[Any, ...]:
-        """Grids of looks and what says which a patch gets, see `compiled.cap_frames.frame`."""
-        from rainstereo.compiled.cap_tiles import OTHER
-
-        grids: list[Array] = []
-        counts: list[int] = []
-        bands: list[tuple[float, int, int, float, int]] = []
-        for (side, aim), wider in zip(self.fineness, WIDER, strict=True):
-            eights = -(-aim // 8) if bands else int(OTHER)
-            bands.append((min(side * side, FAR), aim, len(counts) - 2, wider / aim, eights))
-            for across in range(2, aim // 2 + 1):
-                down = max(aim // across, 2)
-                s, t = (part.ravel() for part in np.meshgrid(_middles(across), _middles(down)))
-                counts.append(len(s))
-                grids.append(np.zeros((5, LANES), dtype=np.float32))
-                grids[-1][:, : len(s)] = s, t, s * s / 2, t * t / 2, s * t
-        table = np.array(bands, dtype=np.float32)
-        return np.concatenate(grids).ravel(), np.array(counts), int(bands[1][2] + 2), table
+    def bands(self) -> Array:
+        """How many looks a patch gets, by its area: see `compiled.cap_tiles`."""
+        rows = [
+            (min(side * side, FAR), aim, wider / aim) for (side, aim), wider in zip(self.fineness, WIDER, strict=True)
+        ]
+        return np.array(rows, dtype=np.float32)
 
     def go(self, mode: int, out: Any, scene: Any, words: Any, caps: CapTable, record: Any) -> None:
         """Run the loops over caps, see `compiled.cap_frames.frame`."""
@@ -169,7 +156,7 @@ class CapScene:
         shift = np.float32(self.shift[0]), np.float32(self.shift[1])
         flat, sizes = out.reshape(-1), (boxes.start, boxes.width, boxes.inverse)
         frame(
-            mode, flat, self.camera.size, scene, words, sizes, border, shift, self.looks, caps.nodes, caps.columns,
+            mode, flat, self.camera.size, scene, words, sizes, border, shift, self.bands, caps.nodes, caps.columns,
             caps.outlines, caps.rivals, lattice.later, lattice.view, record, desk(),
         )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
@@ -9,6 +10,8 @@ from rainstereo import Camera, Chamber, Panel
 from rainstereo.compiled import available
 from rainstereo.droplet import SphericalCap
 from rainstereo.panel_plane import PanelFrame
+from rainstereo.patch import folded_along
+from rainstereo.rain.boxes import Boxes
 from rainstereo.rain.outlines import MARGIN, Outlines
 from rainstereo.refraction import project
 
@@ -16,16 +19,9 @@ needs_numba = pytest.mark.skipif(not available(), reason="needs numba: pip insta
 
 
 @needs_numba
-def test_sums_are_those_of_channels():
+def test_weighted_sums_are_those_of_channels():
     from rainstereo.compiled import cap_vectors
-    from rainstereo.compiled.boxes import channels_of
     from rainstereo.compiled.compile import fused_part
-
-    @fused_part
-    def of_words(words, at, first, count):
-        return channels_of(
-            cap_vectors.sum_of_words(words, at, first, count, (count + np.uint64(7)) // np.uint64(8) * np.uint64(8))
-        )
 
     @fused_part
     def of_weights(words, at, first, rays, weights):
@@ -35,15 +31,91 @@ def test_sums_are_those_of_channels():
     bytes_ = rng.integers(0, 256, (500, 3)).astype(np.uint32)
     bytes_[:100] = 255  # the largest sums there can be
     words = bytes_[:, 0] | bytes_[:, 1] << np.uint32(10) | bytes_[:, 2] << np.uint32(20)
-    for count in (1, 7, 8, 9, 24, 36, 63, 64):
-        for most in (100, 500):
-            at = rng.integers(0, most, 72).astype(np.uint32)
-            found = of_words(words, at, np.uint64(8), np.uint64(count))
-            np.testing.assert_array_equal(found, bytes_[at[8 : 8 + count]].sum(0))
+    at = rng.integers(0, 500, 72).astype(np.uint32)
     rays = rng.uniform(0, 1, 128).astype(np.float32)
     found = of_weights(words, at, np.uint64(3), rays, np.uint64(40))
     np.testing.assert_allclose(found[:3], rays[40:56] @ bytes_[at[3:19]], rtol=1e-6)
     assert found[3] == pytest.approx(rays[40:56].sum(), rel=1e-6)
+
+
+@needs_numba
+@pytest.mark.parametrize("border", ["mirror", "edge"])
+@pytest.mark.parametrize("first", [0, 3, 41])
+def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
+    """Eight pixels side by side against each by itself: grids of looks at the nearest box, or at four, in numpy."""
+    from rainstereo.compiled import cap_patches, cap_rays, cap_tiles
+    from rainstereo.compiled.cap_looks import BIAS
+    from rainstereo.compiled.compile import fused_part
+
+    @fused_part
+    def shown(border, every, fine, words, starts, last, bands, rays, boxes, parts):
+        cap_patches.call_whole(every, fine, words, starts, last, border, bands, rays, boxes, parts)
+        cap_patches.show_whole(every, fine, words, starts, last, bands, rays, boxes, parts)
+
+    rng, size, count = np.random.default_rng(first), (317, 203), 13
+    image = cv2.GaussianBlur(rng.integers(0, 256, (*size[::-1], 3)).astype(np.uint8), (0, 0), 4)
+    image = cv2.normalize(image, image, 0, 255, cv2.NORM_MINMAX)
+    boxes = Boxes.of(size)
+    words = boxes.words(image)
+    rays = np.full((cap_rays.PLANES, 64), np.nan, dtype=np.float32)  # of pixels that are no patches
+    chosen = first + np.flatnonzero(rng.uniform(size=count) < 0.7)
+    fine = rng.uniform(size=64) < 0.4
+    every, small = (sum(1 << int(lane) for lane in lanes) for lanes in (chosen, chosen[fine[chosen]]))
+    planes = {name: rays[int(getattr(cap_tiles, name)) // 64] for name in (
+        "CX", "CY", "AX", "AY", "BX", "BY", "AXX", "AYY", "BXX", "BYY", "ABX", "ABY", "GAINS", "SIZE", "ACROSS",
+        "DOWN", "KIND", "FAR",
+    )}  # fmt: skip
+    for name, plane in planes.items():
+        plane[chosen] = rng.uniform(-6, 6, len(chosen)) if len(name) == 3 else rng.uniform(-30, 30, len(chosen))
+    far = rng.uniform(size=64) < 0.5  # looks beyond the scene
+    for name, middle in (("CX", size[0] / 2), ("CY", size[1] / 2)):
+        planes[name][chosen] = middle + rng.uniform(-30, 30, len(chosen)) * np.where(far[chosen], 40, 1)
+    planes["GAINS"][chosen] = rng.uniform(0.2, 1, len(chosen))
+    planes["SIZE"][chosen] = rng.integers(0, 7, len(chosen))
+    planes["ACROSS"][chosen] = rng.integers(2, 6, len(chosen))
+    planes["DOWN"][chosen] = np.where(fine[chosen], 2, rng.integers(2, 6, len(chosen)))
+    planes["KIND"][chosen], planes["FAR"][chosen] = ~fine[chosen], np.where(far[chosen], -1, 1)
+    rays[int(cap_rays.HIDDEN) // 64, chosen] = rng.uniform(0.5, 1, len(chosen))
+    expected = np.zeros((64, 3))
+    values = np.stack([words >> np.uint32(10 * channel) & np.uint32(1023) for channel in range(3)], -1) - float(BIAS)
+    for lane in chosen:
+        p = {name: float(plane[lane]) for name, plane in planes.items()}
+        s, t = (part.ravel() for part in np.meshgrid(*(
+            (np.arange(n) + 0.5) / n - 0.5 for n in (int(p["ACROSS"]), int(p["DOWN"]))
+        )))  # fmt: skip
+        x, y = (
+            p["C" + i] + p["A" + i] * s + p["B" + i] * t + p["A" + 2 * i] * s * s / 2 + p["B" + 2 * i] * t * t / 2
+            + p["AB" + i] * s * t for i in "XY"
+        )  # fmt: skip
+        x, y = (folded_along(part.astype(np.float32), n - 1, border) for part, n in ((x, size[0]), (y, size[1])))
+        k = int(p["SIZE"])
+        step, some = 1 / float(boxes.inverse[k]), boxes.part(values, k)
+        column, row = (x + 0.5) / step, (y + 0.5) / step  # box j lies about the edge before pixel `step` j
+        if fine[lane]:
+            u, v = (np.floor(4 * part + 0.5) / 4 for part in (column, row))
+            j, i = np.floor(u).astype(int), np.floor(v).astype(int)
+            u, v = (u - j)[:, None], (v - i)[:, None]
+            looks = (1 - v) * ((1 - u) * some[i, j] + u * some[i, j + 1])
+            looks += v * ((1 - u) * some[i + 1, j] + u * some[i + 1, j + 1])
+        else:
+            looks = some[np.floor(row + 0.5).astype(int), np.floor(column + 0.5).astype(int)]
+        expected[lane] = p["GAINS"] * rays[int(cap_rays.HIDDEN) // 64, lane] * looks.mean(0)
+    where = slice(int(cap_rays.SHOWN), int(cap_rays.SHOWN) + 192)
+    flat = rays.ravel()
+    flat[where] = 0
+    places = np.zeros((2, cap_patches.PLACES), dtype=np.uint32)
+    bands = np.array([[400, 10, 1], [1e14, 25, 1]], dtype=np.float32)
+    last = np.float32(size[0] - 1), np.float32(size[1] - 1)
+    shown(
+        0 if border == "mirror" else 1, np.uint64(every), np.uint64(small), words, boxes.start, last, bands, flat,
+        *places,
+    )  # fmt: skip
+    found = flat[where].reshape(64, 3)
+    off = np.abs(found - expected)
+    assert expected.max() > 50
+    assert off.max() < 1.5  # a look between two boxes may fall to either
+    assert np.median(off[chosen]) < 1e-3
+    assert not found[np.setdiff1d(np.arange(64), chosen)].any()
 
 
 @needs_numba
