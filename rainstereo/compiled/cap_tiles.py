@@ -255,6 +255,11 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, sizes: Any, shift: Any, 
         rays[ABY + j] = mixed
         far = far if far < p else p
         rays[FAR + j] = far
+        most = LARGEST if known else LARGEST_ALONE
+        rays[SIZE + j] = most if over < ZERO else ZERO  # for now; what is wider than the scene folds more than once
+    for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
+        ax, ay, bx, by = rays[AX + j], rays[AY + j], rays[BX + j], rays[BY + j]
+        most = rays[SIZE + j]
         area = abs(ax * by - ay * bx)
         aim, part, kind = (aim0, part0, ZERO) if area < small_area else (aim1, part1, np.float32(1))
         rays[KIND + j] = kind
@@ -262,9 +267,8 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, sizes: Any, shift: Any, 
         size = octaves if octaves > nought else nought
         size = size if size < largest else largest
         rays[SIZE + j] = np.float32(size if octaves >= below else below)
-        most = LARGEST if known else LARGEST_ALONE
-        most = most if over < ZERO else ZERO  # wider than the scene: folded more than once
-        rays[LITS + j] = rays[LITS + j] if area < most else PARTLY
+        lights = rays[LITS + j]
+        rays[LITS + j] = lights if area < most or not lights > PARTLY else PARTLY
         ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))
         across = np.float32(math.sqrt(aim * np.float32(math.sqrt(ratio)))) + HALF
         across = across if across < HALF * aim else HALF * aim

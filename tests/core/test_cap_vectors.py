@@ -119,6 +119,37 @@ def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
 
 
 @needs_numba
+def test_what_is_beside_the_light_stays_dark():
+    """Vectors end where they end: pixels behind the last that is lit have no patch, and get no rays of their own."""
+    from rainstereo.compiled import cap_rays, cap_tiles
+    from rainstereo.compiled.compile import fused_part
+
+    @fused_part
+    def patches(rays, low, high, bands, sizes, shift, last):
+        cap_tiles.patches(rays, low, high, bands, sizes, shift, last)
+
+    rays = np.full((cap_rays.PLANES, 64), np.nan, dtype=np.float32)
+    lights = rays[int(cap_tiles.LITS) // 64]
+    lights[:] = 0
+    lights[3:6] = cap_tiles.WHOLE
+    x = np.arange(64, dtype=np.float32)
+    for plane, left, down in ((cap_rays.OWN, 0.5, 0.5), (cap_rays.ABOVE, 0, 0), (cap_rays.BELOW, 0, 1)):
+        first = int(plane) // 64
+        rays[first, 3:8] = 100 + 9 * (x + left)[3:8]
+        rays[first + 1, 3:8] = 100 + 9 * down
+        rays[first + 2] = np.where((x > 2) & (x < 8), 0.9, 0)
+    rays[int(cap_rays.OWN) // 64 + 2, 6:] = 0
+    bands = np.array([[64, 8, 1 / 8], [1e14, 25, 1 / 25]], dtype=np.float32)
+    zero, last = np.float32(0), np.float32(1000)
+    patches(rays.ravel(), 3, 6, bands, 12, (zero, zero), (last, last))
+    np.testing.assert_array_equal(lights[:16], [0, 0, 0, 2, 2, 2, *[0] * 10])
+    np.testing.assert_allclose(rays[int(cap_tiles.AX) // 64, 3:6], 9, rtol=1e-5)
+    np.testing.assert_allclose(rays[int(cap_tiles.BY) // 64, 3:6], 9, rtol=1e-5)
+    np.testing.assert_allclose(rays[int(cap_tiles.CX) // 64, 3:6], 100 + 9 * (x + 0.5)[3:6], rtol=1e-5)
+    np.testing.assert_array_equal(rays[int(cap_tiles.ACROSS) // 64, 3:6] * rays[int(cap_tiles.DOWN) // 64, 3:6], 25)
+
+
+@needs_numba
 def test_lanes_are_found_by_bits_and_written_thrice():
     from rainstereo.compiled import cap_vectors
     from rainstereo.compiled.compile import fused_part
