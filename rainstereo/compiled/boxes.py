@@ -15,33 +15,10 @@ import numpy as np
 from .compile import compiled, inlined
 
 BITS = 10  # of a channel in a word
-FIELD, TWICE = np.uint32(BITS), np.uint32(2 * BITS)
-FIRST = np.uint32((1 << BITS) - 1)
-OUTER, MIDDLE = np.uint64(FIRST | (FIRST << TWICE)), np.uint64(FIRST << FIELD)
-WIDE = 20
-"""Bits of a channel in a word that has been spread: the last channel's from 20, the middle one's from 40 on."""
-TO_WIDE = np.uint64(2 * WIDE - BITS)
+FIELD = np.uint32(BITS)
 LAST = np.uint32((1 << 2 * BITS) + (1 << BITS) + 1)  # bit of each channel
 EVEN = np.uint32(0x3FFFFFFF & ~int(LAST))
 ONE, SHIFT = np.uint64(1), np.uint32(1)
-
-
-@inlined
-def spread(word: Any) -> Any:
-    """A word's channels with room for a million each: sums and weighted sums of such words are those of channels."""
-    word = np.uint64(word)
-    return (word & OUTER) + ((word & MIDDLE) << TO_WIDE)
-
-
-@inlined
-def channels_of(found: Any) -> Any:
-    """The three channels of a sum of words that were spread."""
-    field, most = np.uint64(WIDE), np.uint64((1 << WIDE) - 1)
-    return (
-        np.float32(np.int64(found & most)),
-        np.float32(np.int64(found >> (field + field))),
-        np.float32(np.int64((found >> field) & most)),
-    )
 
 
 @compiled

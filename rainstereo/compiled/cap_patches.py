@@ -41,7 +41,12 @@ def _chosen(builder: Any, bits: Any) -> Any:
 
 
 def _placed(fine: bool, border: int) -> Any:
-    """Where eight pixels look, see `places`."""
+    """Where eight pixels of a row look, from a lane on, as a function (words, rays, lane, bits, looks, starts, last_x,
+    last_y, boxes, parts, first): `looks` vectors of numbers of boxes, to `boxes` from `first` on, which are called for.
+
+    bits: which of the eight. last: the scene's last pixel. fine: at four boxes, by the number of the upper left one; and
+    how far from it, quarters of their distance along and 4 times those down, to `parts`.
+    """
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         words, rays, lane, bits, looks, starts, last_x, last_y, boxes, parts, first = arguments(
@@ -113,7 +118,8 @@ def _of_size(builder: Any, size: Any, starts: Any, last_x: Any) -> tuple[Any, La
 
 
 def _summed(fine: bool) -> Any:
-    """What eight pixels show, see `sums`."""
+    """What eight pixels show that have been `_placed`, as a function (words, rays, lane, bits, looks, last_x, starts,
+    boxes, parts, first), added to `SHOWN`."""
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         words, rays, lane, bits, looks, last_x, starts, boxes, parts, first = arguments(
