@@ -44,7 +44,7 @@ def _placed(fine: bool, border: int) -> Any:
     """Where eight pixels of a row look, from a lane on, as a function (words, rays, lane, bits, looks, starts, last_x,
     last_y, boxes, parts, first): `looks` vectors of numbers of boxes, to `boxes` from `first` on, which are called for.
 
-    bits: which of the eight. last: the scene's last pixel. fine: at four boxes, by the number of the upper left one; and
+    bits: which of the eight. last: the scene's last pixel. fine: at four boxes, by the number of the upper left; and
     how far from it, quarters of their distance along and 4 times those down, to `parts`.
     """
 
