@@ -89,7 +89,8 @@ class Sequence:
         if len(kept) > MOST_GENERATIONS:  # the first is the largest, and stays
             late = kept[1:]
             tables = [table for generation in late for table in generation.tables]
-            tables = type(tables[0]).joined(tables) if tables else tables
+            kinds = {type(table): [same for same in tables if type(same) is type(table)] for table in tables}
+            tables = [table for kind, same in kinds.items() for table in kind.joined(same)]
             kept = [kept[0], _Generation(frozenset().union(*(generation.groups for generation in late)), tables)]
         self._generations = kept
         return [table for generation in kept for table in generation.tables]

@@ -19,7 +19,7 @@ from rainstereo.rain.drops import Drops
 from rainstereo.rain.motion import Motion
 from rainstereo.rain.pane import Pane
 from rainstereo.rain.render import Plan, Renderer
-from rainstereo.rain.sequence import TrailShapes
+from rainstereo.rain.sequence import MOST_GENERATIONS, TrailShapes
 from rainstereo.thin_lens import ThinLens
 
 CAMERA = Camera.pinhole(800, 800, 199.5, 149.5, 400, 300)
@@ -175,6 +175,18 @@ def test_drops_may_come_and_go(frames):
     for frame in frames:
         shown = [drops[i] for i in frame]
         np.testing.assert_array_equal(sequence.plan(shown).apply(image), renderer.plan(shown).apply(image))
+
+
+def test_caps_and_other_shapes_for_moving_drops() -> None:
+    """Some are traced as they are drawn, and some by looks: frame after frame the same bits as each by itself."""
+    renderer = Renderer(CAMERA, PANE, moving=True)
+    sequence, drops = renderer.sequence(), list[Drop]()
+    for number in range(MOST_GENERATIONS + 4):
+        cap = SphericalCap((-0.01 + 0.0028 * number, 1e-3 * (-1) ** number), 1e-3, 0.5 + 0.02 * number)
+        drops.append(HeightMap.of(cap, nodes=33) if number > 1 and number % 2 else cap)
+        found = sequence.plan(drops)
+        assert len({type(table) for table in found.tables}) == (2 if number > 2 else 1)
+        assert_same(found, renderer.plan(drops))
 
 
 def test_a_plan_that_is_kept_is_drawn_as_before() -> None:
