@@ -22,7 +22,7 @@ from .cap_edges import (
     trace_own,
 )
 from .cap_looks import is_whole, show_alone
-from .cap_patches import PLACES, find_boxes, patches_of_row, show_patches
+from .cap_patches import PLACES, call_whole, show_whole, whole_of_row
 from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
 from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
@@ -124,19 +124,19 @@ def frame(
                         continue
                     for j in range(np.uint64(3 * 64)):
                         rays[SHOWN + j] = ZERO
-                    every, fine = patches_of_row(begin, end, rays)
+                    every, fine = whole_of_row(begin, end, rays)
                     if tiny:
                         every = fine = NONE
                     alone = every & ~above(rays, SIZE, -HALF)
                     every, fine = every & ~alone, fine & ~alone
                     if every:
-                        find_boxes(every, fine, words, starts, last, border, bands, rays, places, parts)
+                        call_whole(every, fine, words, starts, last, border, bands, rays, places, parts)
                     made = own_of_row(
                         words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
                         later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden, total, width, out,
                     )  # fmt: skip
                     if every:
-                        show_patches(every, fine, words, starts, last, bands, rays, places, parts)
+                        show_whole(every, fine, words, starts, last, bands, rays, places, parts)
                     while alone:
                         show_alone(scene, last, border, rays, lowest(alone), total)
                         alone &= alone - ONE_LANE

@@ -15,13 +15,13 @@ from numba.extending import intrinsic
 
 from .boxes import BITS
 from .cap_lanes import Lanes
-from .cap_looks import BIAS, MIRROR
+from .cap_looks import BIAS, EDGE, INSIDE, MIRROR
 from .cap_rays import HIDDEN, MARK, PATCH, RIVAL, SHOWN, ZERO
 from .cap_tiles import ACROSS, AIMS, DOWN, FAR, GAINS, KIND, LITS, SIZE, TILE, WHOLE
 from .cap_vectors import FIELD, REALS, WIDE, WORDS, above, above_zero, lanes_from, lowest
 from .compile import fused_part
 from .llvm import BYTE, FOUR, LONG, alike, arguments, ir, load, spread, store
-from .prefetch import add_hint
+from .prefetch import call
 
 EIGHT, LANES = np.uint64(WIDE), np.uint64(0xFF)
 MOST = 64  # looks a pixel
@@ -40,17 +40,16 @@ def _chosen(builder: Any, bits: Any) -> Any:
     return builder.bitcast(builder.trunc(bits, BYTE), ir.VectorType(ir.IntType(1), WIDE))
 
 
-def _placed(fine: bool, beyond: bool) -> Any:
+def _placed(fine: bool, border: int) -> Any:
     """Where eight pixels of a row look, from a lane on, as a function (words, rays, lane, bits, looks, starts, last_x,
-    last_y, mirror, boxes, parts, first): `looks` vectors of numbers of boxes, to `boxes` from `first` on, called for.
+    last_y, boxes, parts, first): `looks` vectors of numbers of boxes, to `boxes` from `first` on, which are called for.
 
-    bits: which of the eight. last: the last pixel of the scene. fine: at four boxes, by the number of the upper left;
-    and how far from it, quarters of their distance along and 4 times those down, to `parts`. beyond: looks may fall
-    out of the scene, which goes on mirrored, or by its edges.
+    bits: which of the eight. last: the scene's last pixel. fine: at four boxes, by the number of the upper left; and
+    how far from it, quarters of their distance along and 4 times those down, to `parts`.
     """
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        words, rays, lane, bits, looks, starts, last_x, last_y, mirror, boxes, parts, first = arguments(
+        words, rays, lane, bits, looks, starts, last_x, last_y, boxes, parts, first = arguments(
             context, builder, signature, given
         )
         plane, chosen = _plane(builder, rays, lane), _chosen(builder, bits)
@@ -60,8 +59,8 @@ def _placed(fine: bool, beyond: bool) -> Any:
         middle = scale * 0.5 + 0.5
         axes = [[plane(int(PATCH) + 64 * (axis + 2 * part)) * scale for part in range(6)] for axis in range(2)]
         lasts = [Lanes.of(builder, last) * scale for last in (last_x, last_y)]
-        if beyond:
-            axes = [[_turned(c, end, mirror), *rest] for (c, *rest), end in zip(axes, lasts, strict=True)]
+        if border == MIRROR:
+            axes = [[_turned(c, end), *rest] for (c, *rest), end in zip(axes, lasts, strict=True)]
         across, down = 1.0 / plane(ACROSS), 1.0 / plane(DOWN)
         left, top = across * 0.5 - 0.5, down * 0.5 - 0.5
 
@@ -72,8 +71,7 @@ def _placed(fine: bool, beyond: bool) -> Any:
         at = []
         for (c, a, b, aa, bb, ab), end in zip(axes, lasts, strict=True):
             place = (c + t * (b + t * (bb * 0.5))) + s * (a + s * (aa * 0.5) + t * ab)
-            place = _folded(place, end, mirror) if beyond else place
-            at.append(builder.fptosi((place + middle).value, WORDS))
+            at.append(builder.fptosi((_folded(place, end, border) + middle).value, WORDS))
         here = builder.add(first, builder.mul(done, LONG(WIDE)))
         if fine:
             u, v = (builder.and_(part, alike(WORDS, 3)) for part in at)
@@ -84,10 +82,10 @@ def _placed(fine: bool, beyond: bool) -> Any:
         store(builder, box, boxes, here)
         for each in range(WIDE):
             number = builder.load(builder.gep(boxes, [builder.add(here, LONG(each))]))
-            add_hint(builder, words, builder.zext(number, LONG))
+            call(builder, words, builder.zext(number, LONG))
             if fine:
                 below = builder.add(number, builder.extract_element(pitch, FOUR(each)))
-                add_hint(builder, words, builder.zext(below, LONG))
+                call(builder, words, builder.zext(below, LONG))
         further, count = s + across, builder.add(done, LONG(1))
         over, most = further.above(0.5), Lanes(builder, alike(REALS, 0.5))
         next_s, next_t = left.where(over, further), (t + down).where(over, t)
@@ -172,17 +170,20 @@ def _interleave(builder: Any, shown: list[Lanes], rays: Any, first: Any) -> None
         (Lanes.at(builder, rays, place) + some).put(rays, place)
 
 
-def _turned(middle: Lanes, last: Lanes, mirror: Any) -> Lanes:
+def _turned(middle: Lanes, last: Lanes) -> Lanes:
     """Middles of patches between -last and last: beyond its edges a mirrored scene repeats itself every 2 last."""
     turn = last + last
     turns = (middle / turn.where(turn.above(1e-3), 1.0) + 0.5).floor()
-    return (middle - turns * turn).where(mirror, middle)
+    return middle - turns * turn
 
 
-def _folded(at: Lanes, last: Lanes, mirror: Any) -> Lanes:
+def _folded(at: Lanes, last: Lanes, border: int) -> Lanes:
     """Coordinates brought between 0 and `last`, as `cap_looks.folded` does, no farther than that from a middle that is
     `_turned`."""
-    at = (last - (last - at.size()).size()).where(mirror, at)
+    if border == INSIDE:
+        return at
+    if border == MIRROR:
+        at = last - (last - at.size()).size()
     at = at.where(at.above(0.0), 0.0)
     return last.where(at.above(last), at)
 
@@ -225,17 +226,17 @@ def _means(builder: Any, words: Any, boxes: Any, parts: Any, first: Any, pitch: 
     return [builder.and_(outer, alike(WORDS, (1 << 2 * BITS) - 1)), middle, builder.lshr(outer, last)]
 
 
-def _place_step(fine: bool, beyond: bool) -> Any:
+def _place_step(fine: bool, border: int) -> Any:
     """`_placed` as a step of loops."""
 
     @intrinsic
     def step(
         _context: Any, words: Any, rays: Any, _lane: Any, _bits: Any, _looks: Any, starts: Any, _x: Any, _y: Any,
-        _mirror: Any, boxes: Any, parts: Any, _first: Any,
+        boxes: Any, parts: Any, _first: Any,
     ) -> Any:  # fmt: skip
         long, real = types.uint64, types.float32
-        given = words, rays, long, long, long, starts, real, real, types.boolean, boxes, parts, long
-        return types.void(*given), _placed(fine, beyond)
+        given = words, rays, long, long, long, starts, real, real, boxes, parts, long
+        return types.void(*given), _placed(fine, border)
 
     return step
 
@@ -254,13 +255,13 @@ def _sum_step(fine: bool) -> Any:
     return step
 
 
-_inside, _beyond = (_place_step(False, beyond) for beyond in (False, True))
-_fine_inside, _fine_beyond = (_place_step(True, beyond) for beyond in (False, True))
+_inside, _at_edge, _mirrored = (_place_step(False, border) for border in (INSIDE, EDGE, MIRROR))
+_fine_inside, _fine_at_edge, _fine_mirrored = (_place_step(True, border) for border in (INSIDE, EDGE, MIRROR))
 _sum, _fine_sum = _sum_step(False), _sum_step(True)
 
 
 @fused_part
-def patches_of_row(low: Any, high: Any, rays: Any) -> Any:
+def whole_of_row(low: Any, high: Any, rays: Any) -> Any:
     """Which pixels of a row are shown as patches, lanes low to before high, as bits; and which of the first band."""
     for each in range(np.uint64(64)):
         whole = rays[HIDDEN + each] if rays[LITS + each] == WHOLE else ZERO
@@ -270,51 +271,53 @@ def patches_of_row(low: Any, high: Any, rays: Any) -> Any:
 
 
 @fused_part
-def find_boxes(
+def call_whole(
     every: Any, fine: Any, words: Any, starts: Any, last: Any, border: Any, bands: Any, rays: Any, boxes: Any,
     parts: Any,
 ) -> None:  # fmt: skip
     """Find the boxes that those pixels look at, and call for them. boxes, parts: (`PLACES`,) uint32."""
-    lane, first, mirror = lowest(every), np.uint64(0), border == MIRROR
-    left, small, beyond = every >> lane, fine >> lane, (every & ~above(rays, FAR, np.float32(-1e-30))) >> lane
-    x, y = last
+    lane, first = lowest(every), np.uint64(0)
+    left, beyond = every >> lane, (every & ~above(rays, FAR, np.float32(-1e-30))) >> lane
     while left:
-        for band in range(2):
-            some, looks = left & (small if band == 0 else ~small), np.uint64(bands[band, AIMS])
-            if not some & LANES:
-                continue
-            if band == 0 and beyond & LANES:
-                _fine_beyond(words, rays, lane, some, looks, starts, x, y, mirror, boxes, parts, first)
-            elif band == 0:
-                _fine_inside(words, rays, lane, some, looks, starts, x, y, mirror, boxes, parts, first)
-            elif beyond & LANES:
-                _beyond(words, rays, lane, some, looks, starts, x, y, mirror, boxes, parts, first)
+        coarse, exact = left & ~(fine >> lane), left & (fine >> lane)
+        out = beyond & LANES
+        if coarse & LANES:
+            looks = np.uint64(bands[1, AIMS])
+            if not out:
+                _inside(words, rays, lane, coarse, looks, starts, last[0], last[1], boxes, parts, first)
+            elif border == MIRROR:
+                _mirrored(words, rays, lane, coarse, looks, starts, last[0], last[1], boxes, parts, first)
             else:
-                _inside(words, rays, lane, some, looks, starts, x, y, mirror, boxes, parts, first)
+                _at_edge(words, rays, lane, coarse, looks, starts, last[0], last[1], boxes, parts, first)
+            first += ROOM
+        if exact & LANES:
+            looks = np.uint64(bands[0, AIMS])
+            if not out:
+                _fine_inside(words, rays, lane, exact, looks, starts, last[0], last[1], boxes, parts, first)
+            elif border == MIRROR:
+                _fine_mirrored(words, rays, lane, exact, looks, starts, last[0], last[1], boxes, parts, first)
+            else:
+                _fine_at_edge(words, rays, lane, exact, looks, starts, last[0], last[1], boxes, parts, first)
             first += ROOM
         lane += EIGHT
         left >>= EIGHT
-        small >>= EIGHT
         beyond >>= EIGHT
 
 
 @fused_part
-def show_patches(
+def show_whole(
     every: Any, fine: Any, words: Any, starts: Any, last: Any, bands: Any, rays: Any, boxes: Any, parts: Any
 ) -> None:  # fmt: skip
-    """Write what those pixels show, whose boxes have been found, to `SHOWN`."""
+    """Write what those pixels show to `SHOWN`."""
     lane, first = lowest(every), np.uint64(0)
-    left, small = every >> lane, fine >> lane
+    left = every >> lane
     while left:
-        for band in range(2):
-            some, looks = left & (small if band == 0 else ~small), np.uint64(bands[band, AIMS])
-            if not some & LANES:
-                continue
-            if band == 0:
-                _fine_sum(words, rays, lane, some, looks, last[0], starts, boxes, parts, first)
-            else:
-                _sum(words, rays, lane, some, looks, last[0], starts, boxes, parts, first)
+        coarse, exact = left & ~(fine >> lane), left & (fine >> lane)
+        if coarse & LANES:
+            _sum(words, rays, lane, coarse, np.uint64(bands[1, AIMS]), last[0], starts, boxes, parts, first)
+            first += ROOM
+        if exact & LANES:
+            _fine_sum(words, rays, lane, exact, np.uint64(bands[0, AIMS]), last[0], starts, boxes, parts, first)
             first += ROOM
         lane += EIGHT
         left >>= EIGHT
-        small >>= EIGHT

@@ -10,7 +10,7 @@ from numba.extending import intrinsic
 ir: Any = vars(cgutils)["ir"]  # of llvmlite, which numba brings along
 
 
-def add_hint(builder: Any, data: Any, index: Any, write: int = 0) -> None:
+def call(builder: Any, data: Any, index: Any, write: int = 0) -> None:
     """Add the hint to code that is being built: an element of what `data` points to."""
     place = builder.bitcast(builder.gep(data, [index]), ir.IntType(8).as_pointer())
     number = ir.IntType(32)
@@ -24,7 +24,7 @@ def _hint(write: int) -> Any:
     def hint(_context: Any, array: Any, _index: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             values = context.make_array(signature.args[0])(context, builder, given[0])
-            add_hint(builder, values.data, given[1], write)
+            call(builder, values.data, given[1], write)
             return context.get_dummy_value()
 
         return types.void(array, types.uint64), code
