@@ -21,6 +21,7 @@ from .cap_edges import (
     slopes_of_row,
     trace_own,
 )
+from .cap_light import draw_light, room_for_light, take_light
 from .cap_looks import is_whole, show_alone
 from .cap_patches import PLACES, call_whole, show_whole, whole_of_row
 from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
@@ -73,7 +74,7 @@ def frame(
     starts, pitches, inverses = boxes
     width, height = size
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
-    rays, line, tile, slopes, total, at, beams, pixels, hidden, places, parts = desk
+    rays, line, tile, slopes, total, at, beams, pixels, hidden, places, parts, light = desk
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
@@ -91,7 +92,7 @@ def frame(
                     1.45 * radius * wide + wide * wide
                 )  # of room: a pixel's corner is 0.71 pixels from its middle
                 hangs, tiny = hangs_over(tile, cap, wide, 1.5 * reach), radius < TINY * wide
-                s, known = np.float32(u1) - u0, False
+                s, known, waiting = np.float32(u1) - u0, False, 0
                 following = next_span(tile, np.float32(v1) - v0, s, lanes, cap, edge, line, rays)
                 for v in range(v1, v2):
                     low, high = following
@@ -131,6 +132,11 @@ def frame(
                     every, fine = every & ~alone, fine & ~alone
                     if every:
                         call_whole(every, fine, words, starts, last, border, bands, rays, places, parts)
+                    if not tiny:
+                        waiting = take_light(
+                            s, t, u1, v, low, high, rays, width, scene.shape[2], light, waiting, words, starts,
+                            last, shift, border, cap, outline, tile, u0, v0, later, view, out,
+                        )  # fmt: skip
                     made = own_of_row(
                         words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
                         later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden, total, width, out,
@@ -141,6 +147,11 @@ def frame(
                         show_alone(scene, last, border, rays, lowest(alone), total)
                         alone &= alone - ONE_LANE
                     write_bytes(out, width, scene.shape[2], v, u1, lanes, rays)
+                if waiting > 0:
+                    draw_light(
+                        waiting, words, starts, last, shift, border, cap, outline, tile, u0, v0, later, view,
+                        scene.shape[2], light, out,
+                    )  # fmt: skip
         if made > 0:
             draw_own(
                 words, scene, starts, last, shift, border, cap, outline, later, view, beams, at, pixels[:made],
@@ -206,7 +217,7 @@ def desk() -> tuple[Any, ...]:
         np.zeros(PLANES * 64, np.float32), np.zeros(15, np.float32), np.zeros((5, 3, 3), np.float32),
         np.zeros(12, np.float32), np.zeros(4, np.float32), np.zeros(64, np.uint32), np.zeros(PLANES * 64, np.float32),
         np.zeros(TOGETHER, np.int64), np.zeros(TOGETHER, np.float32),
-        np.zeros(PLACES, np.uint32), np.zeros(PLACES, np.uint32),
+        np.zeros(PLACES, np.uint32), np.zeros(PLACES, np.uint32), room_for_light(),
     )  # fmt: skip
 
 

@@ -123,6 +123,27 @@ def _arguments(rays: Any, count: int) -> Any:
     return types.void(rays, types.uint64, types.uint64, types.uint64, *[types.float32] * count)
 
 
+def of_light(before: Lanes, inside: Lanes, spread: Lanes, per: Lanes) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Of light about rays: the mean of the component along the normal behind the cap, its mean weighted with itself, its
+    largest square, and what `STRETCH` holds; see `cap_rays.cross`."""
+    high, low = inside + spread, inside - spread
+    high, low = high.where(high.above(0.0)), low.where(low.above(0.0))
+    mean = (high * high.root() - low * low.root()) * (per * (1 / 3))
+    turned = (high + low) * (high - low) * (per * 0.25)
+    product = mean * turned
+    over = 1.0 / product.where(product.above(0.0), 1.0)  # one division for two
+    return mean, turned * (turned * over), high, before * mean * mean * over
+
+
+def refracted(before: Lanes, mean: Lanes, turned: Lanes, curvature: Lanes, q: Lanes) -> tuple[Lanes, Lanes]:
+    """By how much of its way from the sphere's middle a wave vector changes there, and which part of the light passes."""
+    p, t = before + q * turned, before + turned
+    both = 1.0 / (p * t)
+    twice = before * mean
+    passed = (twice + twice) * (p * p + q * t * t) * (both * both)
+    return (1.0 - q) * curvature * (p * both), passed
+
+
 def _through_cap(soft: bool) -> Callable[..., None]:
     """See `cap_rays.cross`."""
     spread_, sharp_, stretch_ = (64 * i for i in (53, 56, 52))
@@ -139,26 +160,14 @@ def _through_cap(soft: bool) -> Callable[..., None]:
         # the root of the quadratic, as the product of both roots over the other
         s = room.where(towards, root - b) / (b + root).where(towards, q)
         before = root * curvature  # component of the wave vector along the sphere's normal
-        less = 1.0 - q
-        inside = before * before + less
+        inside = before * before + (1.0 - q)
         if soft:
             spread, per = at(spread_), at(sharp_)
-            high, low = inside + spread, inside - spread
-            high, low = high.where(high.above(0.0)), low.where(low.above(0.0))
-            mean = (high * high.root() - low * low.root()) * (per * (1 / 3))
-            turned = (high + low) * (high - low) * (per * 0.25)
-            product = mean * turned
-            over = 1.0 / product.where(product.above(0.0), 1.0)  # one division for two
-            put(stretch_, before * mean * mean * over)
-            turned = turned * (turned * over)
-            inside = high
+            mean, turned, inside, stretch = of_light(before, inside, spread, per)
+            put(stretch_, stretch)
         else:
             turned = mean = inside.root()
-        p, t = before + q * turned, before + turned
-        both = 1.0 / (p * t)
-        bend = less * curvature * (p * both)
-        twice = before * mean
-        passed = (twice + twice) * (p * p + q * t * t) * (both * both)
+        bend, passed = refracted(before, mean, turned, curvature, q)
         rise = s * kz
         px, py = px + s * kx, py + s * ky
         up = kz + bend * (rise + depth)
