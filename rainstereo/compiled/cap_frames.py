@@ -23,7 +23,7 @@ from .cap_edges import (
 )
 from .cap_light import draw_light, room_for_light, take_light
 from .cap_looks import is_whole, show_alone
-from .cap_patches import PLACES, call_whole, show_whole, whole_of_row
+from .cap_patches import PLACES, show_whole, whole_of_row
 from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
 from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
@@ -130,8 +130,6 @@ def frame(
                         every = fine = NONE
                     alone = every & ~above(rays, SIZE, -HALF)
                     every, fine = every & ~alone, fine & ~alone
-                    if every:
-                        call_whole(every, fine, words, starts, last, border, bands, rays, places, parts)
                     if not tiny:
                         waiting = take_light(
                             s, t, u1, v, low, high, rays, width, scene.shape[2], light, waiting, words, starts,
@@ -142,7 +140,7 @@ def frame(
                         later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden, total, width, out,
                     )  # fmt: skip
                     if every:
-                        show_whole(every, fine, words, starts, last, bands, rays, places, parts)
+                        show_whole(every, fine, words, starts, last, border, bands, rays, places, parts)
                     while alone:
                         show_alone(scene, last, border, rays, lowest(alone), total)
                         alone &= alone - ONE_LANE

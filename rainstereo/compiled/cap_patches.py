@@ -271,11 +271,11 @@ def whole_of_row(low: Any, high: Any, rays: Any) -> Any:
 
 
 @fused_part
-def call_whole(
+def show_whole(
     every: Any, fine: Any, words: Any, starts: Any, last: Any, border: Any, bands: Any, rays: Any, boxes: Any,
     parts: Any,
 ) -> None:  # fmt: skip
-    """Find the boxes that those pixels look at, and call for them. boxes, parts: (`PLACES`,) uint32."""
+    """Write what those pixels show to `SHOWN`. boxes, parts: (`PLACES`,) uint32."""
     lane, first = lowest(every), np.uint64(0)
     left, beyond = every >> lane, (every & ~above(rays, FAR, np.float32(-1e-30))) >> lane
     while left:
@@ -289,7 +289,7 @@ def call_whole(
                 _mirrored(words, rays, lane, coarse, looks, starts, last[0], last[1], boxes, parts, first)
             else:
                 _at_edge(words, rays, lane, coarse, looks, starts, last[0], last[1], boxes, parts, first)
-            first += ROOM
+            _sum(words, rays, lane, coarse, looks, last[0], starts, boxes, parts, first)
         if exact & LANES:
             looks = np.uint64(bands[0, AIMS])
             if not out:
@@ -298,26 +298,7 @@ def call_whole(
                 _fine_mirrored(words, rays, lane, exact, looks, starts, last[0], last[1], boxes, parts, first)
             else:
                 _fine_at_edge(words, rays, lane, exact, looks, starts, last[0], last[1], boxes, parts, first)
-            first += ROOM
+            _fine_sum(words, rays, lane, exact, looks, last[0], starts, boxes, parts, first)
         lane += EIGHT
         left >>= EIGHT
         beyond >>= EIGHT
-
-
-@fused_part
-def show_whole(
-    every: Any, fine: Any, words: Any, starts: Any, last: Any, bands: Any, rays: Any, boxes: Any, parts: Any
-) -> None:  # fmt: skip
-    """Write what those pixels show to `SHOWN`."""
-    lane, first = lowest(every), np.uint64(0)
-    left = every >> lane
-    while left:
-        coarse, exact = left & ~(fine >> lane), left & (fine >> lane)
-        if coarse & LANES:
-            _sum(words, rays, lane, coarse, np.uint64(bands[1, AIMS]), last[0], starts, boxes, parts, first)
-            first += ROOM
-        if exact & LANES:
-            _fine_sum(words, rays, lane, exact, np.uint64(bands[0, AIMS]), last[0], starts, boxes, parts, first)
-            first += ROOM
-        lane += EIGHT
-        left >>= EIGHT
