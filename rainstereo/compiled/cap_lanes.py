@@ -123,25 +123,26 @@ def _arguments(rays: Any, count: int) -> Any:
     return types.void(rays, types.uint64, types.uint64, types.uint64, *[types.float32] * count)
 
 
-def of_light(before: Lanes, inside: Lanes, spread: Lanes, per: Lanes) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Of light about rays: the mean of the component along the normal behind the cap, its mean weighted with itself, its
-    largest square, and what `STRETCH` holds; see `cap_rays.cross`."""
+def of_light(inside: Lanes, spread: Lanes, per: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """Of light about rays, behind the cap: the mean of the component along the normal, the mean of its square, and the
+    largest square; per: 1 / spread. See `cap_rays.cross`."""
     high, low = inside + spread, inside - spread
     high, low = high.where(high.above(0.0)), low.where(low.above(0.0))
     mean = (high * high.root() - low * low.root()) * (per * (1 / 3))
-    turned = (high + low) * (high - low) * (per * 0.25)
-    product = mean * turned
-    over = 1.0 / product.where(product.above(0.0), 1.0)  # one division for two
-    return mean, turned * (turned * over), high, before * mean * mean * over
+    return mean, (high + low) * (high - low) * (per * 0.25), high
 
 
-def refracted(before: Lanes, mean: Lanes, turned: Lanes, curvature: Lanes, q: Lanes) -> tuple[Lanes, Lanes]:
-    """By how much of its way from the sphere's middle a wave vector changes there, and which part of the light passes."""
-    p, t = before + q * turned, before + turned
-    both = 1.0 / (p * t)
-    twice = before * mean
-    passed = (twice + twice) * (p * p + q * t * t) * (both * both)
-    return (1.0 - q) * curvature * (p * both), passed
+def refracted(before: Lanes, mean: Lanes, square: Lanes, curvature: Lanes, q: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """By how much of its way from the sphere's middle a wave vector changes there; which part of the light passes; and
+    the component before the surface over that behind it, which is `square` / `mean`."""
+    less = before * mean
+    p, t = less + q * square, less + square
+    both = p * t
+    every = both * square
+    over = 1.0 / every.where(every.above(0.0), 1.0)  # one division for all
+    per = mean * square * over
+    passed = (less + less) * (p * p + q * t * t) * (per * per)
+    return (1.0 - q) * curvature * (p * per), passed, less * both * over
 
 
 def _through_cap(soft: bool) -> Callable[..., None]:
@@ -162,12 +163,12 @@ def _through_cap(soft: bool) -> Callable[..., None]:
         before = root * curvature  # component of the wave vector along the sphere's normal
         inside = before * before + (1.0 - q)
         if soft:
-            spread, per = at(spread_), at(sharp_)
-            mean, turned, inside, stretch = of_light(before, inside, spread, per)
-            put(stretch_, stretch)
+            mean, squared, inside = of_light(inside, at(spread_), at(sharp_))
         else:
-            turned = mean = inside.root()
-        bend, passed = refracted(before, mean, turned, curvature, q)
+            squared, mean = inside, inside.root()
+        bend, passed, stretch = refracted(before, mean, squared, curvature, q)
+        if soft:
+            put(stretch_, stretch)
         rise = s * kz
         px, py = px + s * kx, py + s * ky
         up = kz + bend * (rise + depth)

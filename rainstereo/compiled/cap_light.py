@@ -103,19 +103,18 @@ def _traced(
             mx, my, mz = dx + way * da, dy + way * db, way * dz
             more = per_root * (px * mx + py * my + up * mz)
             moves.append((mx + more * a, my + more * b, mz + more * kz, da, db, dz))
-        # half the square of the component before the surface, less a constant, as a quadratic
+        # the component along the normal before the surface, a quadratic: by derivatives of half its square
         ns, nt = zs * depth + xs * a + x * as_ + ys * b + y * bs, zt * depth + xt * a + x * at + yt * b + y * bt
-        scale, twice = curvature * curvature, near + near
-        begun = scale * root * root
-        along, down = ((near * n - q * (x * dx + y * dy)) * scale for n, dx, dy in ((ns, xs, ys), (nt, xt, yt)))
+        scale, begun = curvature * curvature, curvature * root
+        of_s, of_t = (xs, ys, as_, bs, ns), (xt, yt, at, bt, nt)
+        per_begun = 1.0 / begun
+        along, down = ((near * n - q * (x * dx + y * dy)) * scale * per_begun for dx, dy, _, _, n in (of_s, of_t))
         bends = [
-            (n * m - q * (dx * ex + dy * ey) + near * (dx * ea + ex * da + dy * eb + ey * db)) * scale
-            for (n, dx, dy, da, db), (m, ex, ey, ea, eb) in (
-                ((ns, xs, ys, as_, bs),) * 2, ((ns, xs, ys, as_, bs), (nt, xt, yt, at, bt)), ((nt, xt, yt, at, bt),) * 2,
-            )
+            ((n * m - q * (dx * ex + dy * ey) + near * (dx * ea + ex * da + dy * eb + ey * db)) * scale - one * other)
+            * (per_begun * (0.5 if of_one is of_other else 1.0))
+            for of_one, of_other, one, other in ((of_s, of_s, along, along), (of_s, of_t, along, down), (of_t, of_t, down, down))
+            for (dx, dy, da, db, n), (ex, ey, ea, eb, m) in ((of_one, of_other),)
         ]  # fmt: skip
-        along, down = along + along, down + down
-        cross_ = bends[1] + bends[1]
 
         far_x, far_y = s - u, t - v
         beside = far_x.size().above(far_y.size() * STEEP)
@@ -126,7 +125,7 @@ def _traced(
         ones = Lanes(builder, alike(REALS, 1.0))
         wide, high = ((ones * (1 / FORMS[0][k])).where(beside, one) for k, one in ((0, wide), (1, high)))
         dx, dy = along * wide, down * high
-        soft = (dx * dx + dy * dy).root() * 0.5
+        soft = (dx * dx + dy * dy).root() * begun
         soft = soft.where(soft.above(float(SOFTEST)), float(SOFTEST))
         sharp = 1.0 / soft
         # how far within the contact circle a ray is, in parts of what it stands for: along a tangent, as in `cap_shares`
@@ -154,10 +153,9 @@ def _traced(
             begin + i * one + j * other
             for begin, one, other in zip((px, py, rise, a, b, kz), moves[0], moves[1], strict=True)
         ]
-        squared = begun + i * (along + i * bends[0] + j * cross_) + j * (down + j * bends[2])
-        before, inside = squared.root(), squared + (1.0 - q)
-        mean, turned, lit_square, stretch = of_light(before, inside, soft, sharp)
-        bend, passed = refracted(before, mean, turned, curvature, q)
+        before = begun + i * (along + i * bends[0] + j * bends[1]) + j * (down + j * bends[2])
+        mean, inside, most = of_light(before * before + (1.0 - q), soft, sharp)
+        bend, passed, stretch = refracted(before, mean, inside, curvature, q)
         fx, fy, fz, fa, fb, fc = fields
         out = fc + bend * (fz + depth)
         for plane, value in (
@@ -165,7 +163,7 @@ def _traced(
             (PER, box),
         ):  # fmt: skip
             put(int(plane), value)
-        lit = builder.and_(lit_square.above(0.0), out.above(0.0))
+        lit = builder.and_(most.above(0.0), out.above(0.0))
         put(int(SUB + GAIN), (passed * dim).where(lit))
         share = within - i * gx - j * gy
         share = share.where(share.above(0.0))
