@@ -132,7 +132,8 @@ def _traced(
         gx, gy, reach = x * xs + y * ys, x * xt + y * yt, (x * x + y * y).root()
         radius = square.root()
         within = (radius - reach) * reach - (gx * gx + gy * gy) * float(SAGITTA) / (radius * reach)
-        per_part = 1.0 / ((gx * wide).size() + (gy * high).size())
+        one, other = gx * wide, gy * high
+        per_part = 1.0 / (one * one + other * other).root()  # a line's mean slope across a rectangle
         within, gx, gy = (within * per_part + 0.5).where((1.0 - hidden).above(0.0), 1e9), gx * per_part, gy * per_part
         far = far_x * far_x + far_y * far_y
         box = float(WIDER * SMALLEST) / RAYS / far.where(far.above(1.0), 1.0)
@@ -142,7 +143,8 @@ def _traced(
         start, loop, after = builder.block, builder.append_basic_block("ray"), builder.append_basic_block("traced")
         builder.branch(loop)
         builder.position_at_end(loop)
-        number, i, j = builder.phi(LONG), Lanes(builder, builder.phi(REALS)), Lanes(builder, builder.phi(REALS))
+        number, *phis = builder.phi(LONG), *[builder.phi(REALS) for _ in range(3)]
+        i, j, total = (Lanes(builder, phi) for phi in phis)
         part, lane = builder.lshr(number, LONG(3)), builder.shl(builder.and_(number, LONG(7)), LONG(3))
         here = builder.add(builder.mul(part, LONG(int(BEAMS))), lane)
 
@@ -167,7 +169,9 @@ def _traced(
         put(int(SUB + GAIN), (passed * dim).where(lit))
         share = within - i * gx - j * gy
         share = share.where(share.above(0.0))
-        put(int(SHARE), share.where((1.0 - share).above(0.0), 1.0))
+        share = share.where((1.0 - share).above(0.0), 1.0)
+        put(int(SHARE), share)
+        summed_up = total + share
 
         further, count = i + wide, builder.add(number, LONG(1))
         ended = further.above(0.5)
@@ -175,10 +179,13 @@ def _traced(
         builder.cbranch(builder.icmp_unsigned("<", count, LONG(RAYS)), loop, after)
         for phi, begin, coming in (
             (number, LONG(0), count), (i.value, left.value, next_i.value), (j.value, top.value, next_j.value),
+            (total.value, alike(REALS, 0.0), summed_up.value),
         ):  # fmt: skip
             phi.add_incoming(begin, start)
             phi.add_incoming(coming, loop)
         builder.position_at_end(after)
+        unit = hidden * RAYS / summed_up.where(summed_up.above(0.0), 1.0)
+        unit.put(places, builder.add(first, LONG(3 * TOGETHER)))
         return context.get_dummy_value()
 
     long, real = types.uint64, types.float32
@@ -286,17 +293,17 @@ def draw_light(
     for first in range(nothing, stop, EIGHT):
         summed(words, at, weights, first * np.uint64(RAYS), shown)
         for k in range(first, min(first + EIGHT, stop)):
-            clear = ONE - places[k + np.uint64(2 * TOGETHER)]
+            clear, unit = ONE - places[k + np.uint64(2 * TOGETHER)], places[k + np.uint64(3 * TOGETHER)]
             for channel in range(np.uint64(channels)):
                 number = np.uint64(pixels[k]) + channel
-                value = shown[EIGHT * channel + k - first] + clear * np.float32(out[number]) + HALF
+                value = shown[EIGHT * channel + k - first] * unit + clear * np.float32(out[number]) + HALF
                 out[number] = np.uint8(np.int32(value if value < WHITE else WHITE))
 
 
 def room_for_light() -> tuple[Any, ...]:
     """Beams, places, addresses, numbers of boxes, weights, what is shown, and numbers of boxes of 64 rays."""
     return (
-        np.zeros(int(BEAMS) * HALVES, np.float32), np.zeros(3 * TOGETHER, np.float32), np.zeros(TOGETHER, np.int64),
+        np.zeros(int(BEAMS) * HALVES, np.float32), np.zeros(4 * TOGETHER, np.float32), np.zeros(TOGETHER, np.int64),
         np.zeros(TOGETHER * RAYS, np.uint32), np.zeros(TOGETHER * RAYS, np.float32), np.zeros(3 * WIDE, np.float32),
         np.zeros(64, np.uint32),
     )  # fmt: skip
