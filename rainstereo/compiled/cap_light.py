@@ -9,6 +9,7 @@ exact where light ends. Everything else is as in `cap_edges`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,31 @@ def _on_tile(builder: Any, tile: Any, plane: int, s: Lanes, t: Lanes) -> tuple[L
     a, b, c = (of(0, power) + t * (of(1, power) + t * of(2, power)) for power in range(3))
     p, q, r = (of(1, power) + (t + t) * of(2, power) for power in range(3))
     return a + s * (b + s * c), b + (s + s) * c, p + s * (q + s * r)
+
+
+def _over_looks(builder: Any, wide: Lanes, high: Lanes, body: Callable[[Any, Lanes, Lanes], Lanes]) -> Lanes:
+    """A loop over the rays of eight pixels, on grids of parts so wide and high of theirs: body(number of the first of a
+    ray's lanes, place along, place down). Returns the sum of what it returns."""
+    left, top = wide * 0.5 - 0.5, high * 0.5 - 0.5
+    start, loop, after = builder.block, builder.append_basic_block("ray"), builder.append_basic_block("rays")
+    builder.branch(loop)
+    builder.position_at_end(loop)
+    number, *phis = builder.phi(LONG), *[builder.phi(REALS) for _ in range(3)]
+    i, j, total = (Lanes(builder, phi) for phi in phis)
+    part, lane = builder.lshr(number, LONG(3)), builder.shl(builder.and_(number, LONG(7)), LONG(3))
+    added = total + body(builder.add(builder.mul(part, LONG(int(BEAMS))), lane), i, j)
+    further, count = i + wide, builder.add(number, LONG(1))
+    ended = further.above(0.5)
+    next_i, next_j = left.where(ended, further), (j + high).where(ended, j)
+    builder.cbranch(builder.icmp_unsigned("<", count, LONG(RAYS)), loop, after)
+    for phi, begin, coming in (
+        (number, LONG(0), count), (i.value, left.value, next_i.value), (j.value, top.value, next_j.value),
+        (total.value, alike(REALS, 0.0), added.value),
+    ):  # fmt: skip
+        phi.add_incoming(begin, start)
+        phi.add_incoming(coming, loop)
+    builder.position_at_end(after)
+    return added
 
 
 @intrinsic
@@ -138,52 +164,39 @@ def _traced(
         far = far_x * far_x + far_y * far_y
         box = float(WIDER * SMALLEST) / RAYS / far.where(far.above(1.0), 1.0)
         dim = dim * (1 / RAYS)
-        left, top = wide * 0.5 - 0.5, high * 0.5 - 0.5
 
-        start, loop, after = builder.block, builder.append_basic_block("ray"), builder.append_basic_block("traced")
-        builder.branch(loop)
-        builder.position_at_end(loop)
-        number, *phis = builder.phi(LONG), *[builder.phi(REALS) for _ in range(3)]
-        i, j, total = (Lanes(builder, phi) for phi in phis)
-        part, lane = builder.lshr(number, LONG(3)), builder.shl(builder.and_(number, LONG(7)), LONG(3))
-        here = builder.add(builder.mul(part, LONG(int(BEAMS))), lane)
-
-        def put(plane: int, value: Lanes) -> None:
+        def put(here: Any, plane: Any, value: Lanes) -> None:
             value.put(data, builder.add(here, LONG(int(plane))))
 
-        fields = [
-            begin + i * one + j * other
-            for begin, one, other in zip((px, py, rise, a, b, kz), moves[0], moves[1], strict=True)
-        ]
-        before = begun + i * (along + i * bends[0] + j * bends[1]) + j * (down + j * bends[2])
-        mean, inside, most = of_light(before * before + (1.0 - q), soft, sharp)
-        bend, passed, stretch = refracted(before, mean, inside, curvature, q)
-        fx, fy, fz, fa, fb, fc = fields
-        out = fc + bend * (fz + depth)
-        for plane, value in (
-            (PX, fx), (PY, fy), (RISE, fz), (KX, fa + bend * fx), (KY, fb + bend * fy), (KZ, out), (STRETCH, stretch),
-            (PER, box),
-        ):  # fmt: skip
-            put(int(plane), value)
-        lit = builder.and_(most.above(0.0), out.above(0.0))
-        put(int(SUB + GAIN), (passed * dim).where(lit))
-        share = within - i * gx - j * gy
-        share = share.where(share.above(0.0))
-        share = share.where((1.0 - share).above(0.0), 1.0)
-        put(int(SHARE), share)
-        summed_up = total + share
+        def behind(here: Any, i: Lanes, j: Lanes) -> Lanes:
+            before = begun + i * (along + i * bends[0] + j * bends[1]) + j * (down + j * bends[2])
+            mean, inside, _ = of_light(before * before + (1.0 - q), soft, sharp)
+            for plane, value in ((KX, mean), (KY, inside), (KZ, before)):
+                put(here, plane, value)
+            share = within - i * gx - j * gy
+            share = share.where(share.above(0.0))
+            share = share.where((1.0 - share).above(0.0), 1.0)
+            put(here, SHARE, share)
+            return share
 
-        further, count = i + wide, builder.add(number, LONG(1))
-        ended = further.above(0.5)
-        next_i, next_j = left.where(ended, further), (j + high).where(ended, j)
-        builder.cbranch(builder.icmp_unsigned("<", count, LONG(RAYS)), loop, after)
-        for phi, begin, coming in (
-            (number, LONG(0), count), (i.value, left.value, next_i.value), (j.value, top.value, next_j.value),
-            (total.value, alike(REALS, 0.0), summed_up.value),
-        ):  # fmt: skip
-            phi.add_incoming(begin, start)
-            phi.add_incoming(coming, loop)
-        builder.position_at_end(after)
+        def through(here: Any, i: Lanes, j: Lanes) -> Lanes:
+            mean, inside, before = (Lanes.at(builder, data, builder.add(here, LONG(int(p)))) for p in (KX, KY, KZ))
+            bend, passed, stretch = refracted(before, mean, inside, curvature, q)
+            fx, fy, fz, fa, fb, fc = (
+                begin + i * one + j * other
+                for begin, one, other in zip((px, py, rise, a, b, kz), moves[0], moves[1], strict=True)
+            )
+            out = fc + bend * (fz + depth)
+            lit = builder.and_(mean.above(0.0), out.above(0.0))
+            for plane, value in (
+                (PX, fx), (PY, fy), (RISE, fz), (KX, fa + bend * fx), (KY, fb + bend * fy), (KZ, out),
+                (STRETCH, stretch), (PER, box), (SUB + GAIN, (passed * dim).where(lit)),
+            ):  # fmt: skip
+                put(here, plane, value)
+            return mean
+
+        summed_up = _over_looks(builder, wide, high, behind)
+        _over_looks(builder, wide, high, through)
         unit = hidden * RAYS / summed_up.where(summed_up.above(0.0), 1.0)
         unit.put(places, builder.add(first, LONG(3 * TOGETHER)))
         return context.get_dummy_value()
