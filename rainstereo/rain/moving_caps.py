@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
 from typing import Any, cast
 
 import numpy as np
@@ -30,7 +29,7 @@ from rainstereo.types import Array, Image, Indices, Mask
 from .boxes import Boxes
 from .contacts import touching
 from .drops import Drops
-from .outlines import Outlines
+from .outlines import BETWEEN, MARGIN, RING
 
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
@@ -68,7 +67,7 @@ class FaceLattice:
         points, waves = (part @ frame.R_panel_cam.T for part in (rays.origins, rays.directions))
         nodes = np.stack([points[..., 0], points[..., 1], waves[..., 0], waves[..., 1]])
         later, end = _behind(chamber, panel)
-        view = _view(camera, frame, end, depth)
+        view = _view(camera, frame, end, depth).astype(np.float32)
         return cls(nodes, later, view, frame.origin(chamber, panel), float(chamber.panels[panel].index))
 
     @property
@@ -116,6 +115,13 @@ class CapScene:
     def frame(self) -> PanelFrame:
         """The chamber's."""
         return PanelFrame.of(self.chamber)
+
+    @cached_property
+    def place(self) -> tuple[Array, Array, Array]:
+        """Where the face is, what is before it, and how the camera sees it: see `compiled.cap_outlines`."""
+        foot = self.frame.base(self.chamber, (0.0, 0.0), self.panel, "far")
+        layers = [(panel.thickness, panel.index) for panel in self.chamber.panels[: self.panel + 1]]
+        return foot, np.array(layers, dtype=np.float64), _view(self.camera, self.frame, 0.0, math.inf)
 
     def nodes(self, indices: tuple[float, ...]) -> Array:
         """The lattice, and how drops of each index dim."""
@@ -174,27 +180,28 @@ class CapTable:
     circles: Array = field(repr=False)
 
     @classmethod
-    def of(cls, scene: CapScene, caps: Sequence[SphericalCap], outlines: Outlines, groups: Indices) -> CapTable:
-        """A table of caps on the scene's face; groups: (N,) numbers kept with them."""
+    def of(cls, scene: CapScene, caps: Sequence[SphericalCap], numbers: Indices) -> CapTable:
+        """Those that the image shows of caps on the scene's face; numbers: (N,) kept with them."""
         rows = [(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps]
-        return cls.of_columns(scene, np.array(rows, dtype=np.float64).reshape(-1, 5), outlines, groups)
-
-    @classmethod
-    def of_columns(cls, scene: CapScene, caps: Array, outlines: Outlines, groups: Indices) -> CapTable:
-        """The same, of the first five columns of `caps`."""
-        table = np.concatenate([caps, groups[:, None]], axis=1)
-        circles = np.stack([outlines.x, outlines.y, np.minimum(outlines.radius, FAR)], -1)
-        return cls._ordered(scene, table, circles)
+        return cls._shown(scene, np.ascontiguousarray(np.array(rows, dtype=np.float64).T), numbers, caps)
 
     @classmethod
     def of_table(cls, scene: CapScene, drops: Drops) -> CapTable:
-        """Those that the image shows of drops on the scene's face, numbered as they come."""
-        check_places(scene, cast(Sequence[SphericalCap], drops.lazily()), (drops.x, drops.y, drops.top))
-        outlines = Outlines.of_table(drops, scene.camera, scene.chamber, scene.frame)
+        """The same of drops in a table, numbered as they come."""
         index = np.full(len(drops), drops.index)
-        caps = np.stack([drops.x, drops.y, drops.radius, drops.contact_angle, index], -1)
-        shown = np.flatnonzero(outlines.radius > 0)
-        return cls.of_columns(scene, caps[shown], outlines.take(shown), shown)
+        columns = np.array([drops.x, drops.y, drops.radius, drops.contact_angle, index])
+        return cls._shown(scene, columns, np.arange(len(drops)), cast(Sequence[SphericalCap], drops.lazily()))
+
+    @classmethod
+    def _shown(cls, scene: CapScene, columns: Array, numbers: Indices, caps: Sequence[SphericalCap]) -> CapTable:
+        from rainstereo.compiled.cap_outlines import outline
+
+        _check_places(scene, caps, columns)
+        table, circles = np.empty((len(numbers), 6)), np.empty((len(numbers), 3))
+        count = outline(
+            columns, numbers, *scene.place, RING, BETWEEN, (MARGIN, FAR), scene.camera.size, table, circles
+        )  # fmt: skip
+        return cls._ordered(scene, table[:count], circles[:count])
 
     @classmethod
     def _ordered(cls, scene: CapScene, caps: Array, circles: Array) -> CapTable:
@@ -346,20 +353,20 @@ class _Tabulated:
     weights: Array
 
 
-def check_places(scene: CapScene, caps: Sequence[SphericalCap], columns: tuple[Array, Array, Array]) -> None:
+def _check_places(scene: CapScene, caps: Sequence[SphericalCap], columns: Array) -> None:
     """ValueError unless the chamber has room for caps on a far face, and the scene lies beyond them.
 
-    columns: x and y of the caps' centres and their tops; caps themselves are looked at only where something is wrong.
+    columns: (5, N) of the caps, which are looked at only where something is wrong.
     """
-    chamber, panel, (x, y, top) = scene.chamber, scene.panel, columns
+    chamber, panel, (x, y, radius, angle, _) = scene.chamber, scene.panel, columns
     space = panel_plane.room(chamber, panel, "far")
-    if top.max() >= space:
+    if math.isfinite(space) and not (radius * np.tan(angle / 2)).max() < space:
         for cap in caps:
             cap.check_room(space)
-    corners = product((x.min(), x.max()), (y.min(), y.max()))
-    bases = [scene.frame.base(chamber, (float(a), float(b)), panel, "far") for a, b in corners]
-    if not scene.depth > scene.frame.to_camera(np.array(bases))[:, 2].max():
-        DropStack(chamber, caps).check_depth(scene.depth)
+    if math.isfinite(scene.depth):
+        foot, along = scene.place[0], scene.frame.R_panel_cam[:, 2]
+        if not scene.depth > foot @ along + (x * along[0] + y * along[1]).max():
+            DropStack(chamber, caps).check_depth(scene.depth)
 
 
 def _record(pixels: int, taps: int) -> tuple[Any, ...]:
@@ -397,7 +404,7 @@ def _view(camera: Camera, frame: PanelFrame, end: float, depth: float) -> Array:
         fold = 0.999 * min(float(fold_radius(camera.distortion)), 1e6)
         view[-1] = fold * fold
         view += [fx, fy, *camera.distortion.tolist(), *[0.0] * (12 - len(camera.distortion))]
-    return np.array(view, dtype=np.float32)
+    return np.array(view, dtype=np.float64)
 
 
-__all__ = ["CapScene", "CapTable", "check_places"]
+__all__ = ["CapScene", "CapTable"]
