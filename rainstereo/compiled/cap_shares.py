@@ -230,15 +230,17 @@ def count_rivals(x: Any, y: Any, radius: Any, counts: Any) -> None:
 
 
 @compiled
-def list_rivals(x: Any, y: Any, radius: Any, rivals: Any) -> None:
-    """Their numbers, in the order of the circles that they meet, and of their own."""
-    at = 0
-    for i in range(len(x)):
-        for j in range(len(x)):
+def list_rivals(x: Any, y: Any, radius: Any, counts: Any, rivals: Any) -> None:
+    """Their numbers, in the order of the circles that they meet, and of their own; counts: how many they are."""
+    at = np.uint64(0)
+    for i in range(np.uint64(len(x))):
+        stop, j = at + np.uint64(counts[i]), np.uint64(0)
+        while at < stop:
             dx, dy, reach = x[i] - x[j], y[i] - y[j], radius[i] + radius[j]
-            if dx * dx + dy * dy < reach * reach and radius[i] > 0 and radius[j] > 0 and i != j:
+            if dx * dx + dy * dy < reach * reach and radius[j] > 0 and i != j:
                 rivals[at] = j
-                at += 1
+                at += np.uint64(1)
+            j += np.uint64(1)
 
 
 @fused_part

@@ -257,9 +257,8 @@ class CapTable:
     @cached_property
     def outlines(self) -> Array:
         """(N, 5), see `compiled.cap_tiles`: circles, and the part of `rivals` that is each cap's."""
-        first, _ = self._rivals
-        count = np.diff(first)
-        return np.concatenate([self.circles, np.stack([first[:-1], count], -1)], axis=1)
+        counts, _ = self._rivals
+        return np.concatenate([self.circles, np.stack([np.cumsum(counts) - counts, counts], -1)], axis=1)
 
     @property
     def rivals(self) -> Indices:
@@ -268,22 +267,19 @@ class CapTable:
 
     @cached_property
     def _rivals(self) -> tuple[Indices, Indices]:
+        """How many they are, (N,), and their numbers, cap by cap."""
         x, y, radius = np.ascontiguousarray(self.circles.T)
-        count = len(self.caps)
-        if count <= FEW:
+        if len(x) <= FEW:
             from rainstereo.compiled import cap_shares as loops
 
-            counts = np.empty(count, dtype=np.int64)
+            counts = np.empty(len(x), dtype=np.int64)
             loops.count_rivals(x, y, radius, counts)
-            first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-            rivals = np.empty(first[-1], dtype=np.int64)
-            loops.list_rivals(x, y, radius, rivals)
-            return first, rivals
-        shown = np.flatnonzero(radius > 0)
-        one, other = touching(x[shown], y[shown], radius[shown])
-        one, other = shown[np.concatenate([one, other])], shown[np.concatenate([other, one])]
-        first = np.concatenate([[0], np.cumsum(np.bincount(one, minlength=count))]).astype(np.int64)
-        return first, other[np.argsort(one, kind="stable")].astype(np.int64)
+            rivals = np.empty(counts.sum(), dtype=np.int64)
+            loops.list_rivals(x, y, radius, counts, rivals)
+            return counts, rivals
+        one, other = touching(x, y, radius)
+        one, other = np.concatenate([one, other]), np.concatenate([other, one])
+        return np.bincount(one, minlength=len(x)), other[np.argsort(one, kind="stable")]
 
     # -- drawn ---------------------------------------------------------------------------------------------------------
 
