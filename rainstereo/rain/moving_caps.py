@@ -41,7 +41,7 @@ each."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
 WIDER = 1.4, 1.25
 """Area of a box over that of its part of what a pixel shows: a little overlap is best."""
-FEW = 400  # caps, up to which all pairs are compared
+FEW = 1500  # caps, up to which all pairs are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +279,7 @@ class CapTable:
             return counts, rivals
         one, other = touching(x, y, radius)
         one, other = np.concatenate([one, other]), np.concatenate([other, one])
-        return np.bincount(one, minlength=len(x)), other[np.argsort(one, kind="stable")]
+        return np.bincount(one, minlength=len(x)), other[np.lexsort((other, one))]
 
     # -- drawn ---------------------------------------------------------------------------------------------------------
 
