@@ -1,4 +1,4 @@
-"""Where in the image caps on a panel's far face are: as `rain.outlines.Outlines`, for those of one frame."""
+"""Tables of caps on a panel's far face: where the image shows them (as `rain.outlines`), and which meet."""
 
 from __future__ import annotations
 
@@ -7,7 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from .cap_rays import VIEW_C, VIEW_FOLD, VIEW_LENS
+from .cap_rays import (
+    CAP_CURVATURE,
+    CAP_DEPTH,
+    CAP_DIM,
+    CAP_INDEX,
+    CAP_SQUARE,
+    CAP_X,
+    CAP_Y,
+    VIEW_C,
+    VIEW_FOLD,
+    VIEW_LENS,
+)
+from .cap_tiles import OUT_RIVAL, OUT_RIVALS
 from .compile import compiled, inlined
 
 ITERATIONS = 100
@@ -20,18 +32,18 @@ that (`refraction`)."""
 
 @compiled
 def outline(
-    columns: Any, numbers: Any, foot: Any, layers: Any, view: Any, ring: Any, between: Any, limits: Any, size: Any,
-    caps: Any, circles: Any,
+    x: Any, y: Any, radius: Any, angle: Any, index: Any, foot: Any, layers: Any, view: Any, ring: Any, between: Any,
+    limits: Any, size: Any,
 ) -> Any:  # fmt: skip
-    """Write which caps the image shows, (N, 6): x, y, radius, angle, index and number; and their circles, (N, 3).
+    """Those of N caps that the image shows, (M, 6): x, y, radius, angle, index and number; and their circles, (M, 3).
 
-    columns: (5, N) the first five, numbers: (N,). foot: (3,) origin of the face's coordinates in the panel frame.
+    x, ...: (N,) read-only; index: (N,), or (1,) of all. foot: (3,) origin of the face's coordinates in the panel frame.
     layers: (L, 2), thickness and index, of the panels up to the face. view: as in `cap_rays`, float64. ring: (S, 2)
     points of a circle, between: (S, A) from numbers there to those at a polygon around it. limits: pixels around a cap
-    that are its own too, and the radius of a circle of what has no image. Returns how many there are.
+    that are its own too, and the radius of a circle of what has no image. In the order of `ordered`.
     """
-    x, y, radius, angle, index = columns[0], columns[1], columns[2], columns[3], columns[4]
     margin, endless = limits
+    caps, circles = np.empty((len(x), 6)), np.empty((len(x), 3))
     seen, around = np.uint64(between.shape[0]), np.uint64(between.shape[1])
     at, shown = np.empty(PLANES * 64), 0
     for i in range(len(x)):
@@ -69,10 +81,83 @@ def outline(
         off_y = middle_y - min(max(middle_y, -0.5), size[1] - 0.5)
         if math.hypot(off_x, off_y) < out:
             caps[shown, 0], caps[shown, 1], caps[shown, 2] = x[i], y[i], radius[i]
-            caps[shown, 3], caps[shown, 4], caps[shown, 5] = angle[i], index[i], numbers[i]
+            caps[shown, 3], caps[shown, 4], caps[shown, 5] = angle[i], index[i % len(index)], i
             circles[shown, 0], circles[shown, 1], circles[shown, 2] = middle_x, middle_y, out
             shown += 1
-    return shown
+    return ordered(caps[:shown], circles[:shown])
+
+
+@compiled
+def ordered(caps: Any, circles: Any) -> Any:
+    """Caps and their circles in an order of their own: by index, angle, radius, y and x; equal ones as they come."""
+    order = np.arange(len(caps))
+    gap = len(caps) // 2
+    while gap > 0:  # Shell's sort
+        for i in range(gap, len(caps)):
+            one, j = order[i], i
+            while j >= gap and _comes_before(caps, one, order[j - gap]):
+                order[j] = order[j - gap]
+                j -= gap
+            order[j] = one
+        gap //= 2
+    return caps[order], circles[order]
+
+
+@inlined
+def _comes_before(caps: Any, one: Any, other: Any) -> Any:
+    before = one < other
+    for column in range(5):
+        a, b = caps[one, column], caps[other, column]
+        before = a < b if a != b else before
+    return before
+
+
+@compiled
+def meeting(circles: Any) -> Any:
+    """How many other circles meet each, (N,), and their numbers, in the order of the circles that they meet, and of
+    their own."""
+    x, y, radius = circles[:, 0].copy(), circles[:, 1].copy(), circles[:, 2].copy()
+    counts = np.empty(len(x), np.int64)
+    for i in range(len(x)):
+        found = -1
+        for j in range(len(x)):
+            dx, dy, reach = x[i] - x[j], y[i] - y[j], radius[i] + radius[j]
+            found += dx * dx + dy * dy < reach * reach
+        counts[i] = found
+    rivals, at = np.empty(counts.sum(), np.int64), np.uint64(0)
+    for i in range(np.uint64(len(x))):
+        stop, j = at + np.uint64(counts[i]), np.uint64(0)
+        while at < stop:
+            dx, dy, reach = x[i] - x[j], y[i] - y[j], radius[i] + radius[j]
+            if dx * dx + dy * dy < reach * reach and i != j:
+                rivals[at] = j
+                at += np.uint64(1)
+            j += np.uint64(1)
+    return counts, rivals
+
+
+@compiled
+def tabulated(caps: Any, circles: Any, counts: Any, origin: Any) -> Any:
+    """Caps as `cap_rays` takes them, (N, 7), outlines as `cap_tiles` does, (N, 5), and the caps' indices, (I,).
+
+    counts: (N,) of each cap's rivals. origin: of the face's coordinates. The caps are `ordered`.
+    """
+    columns, outlines, indices = np.empty((len(caps), 7)), np.empty((len(caps), 5)), np.empty(len(caps))
+    kinds, first = 0, 0
+    for i in range(len(caps)):
+        radius, angle, index = caps[i, 2], caps[i, 3], caps[i, 4]
+        if i == 0 or index != caps[i - 1, 4]:
+            indices[kinds] = index
+            kinds += 1
+        columns[i, CAP_X], columns[i, CAP_Y] = origin[0] + caps[i, 0], origin[1] + caps[i, 1]
+        columns[i, CAP_SQUARE], columns[i, CAP_DEPTH] = radius * radius, radius / math.tan(angle)
+        columns[i, CAP_CURVATURE] = math.sin(angle) / radius
+        columns[i, CAP_INDEX], columns[i, CAP_DIM] = index, kinds - 1
+        for k in range(3):
+            outlines[i, k] = circles[i, k]
+        outlines[i, OUT_RIVAL], outlines[i, OUT_RIVALS] = first, counts[i]
+        first += counts[i]
+    return columns, outlines, indices[:kinds]
 
 
 @inlined

@@ -182,42 +182,46 @@ class CapTable:
     @classmethod
     def of(cls, scene: CapScene, caps: Sequence[SphericalCap], numbers: Indices) -> CapTable:
         """Those that the image shows of caps on the scene's face; numbers: (N,) kept with them."""
-        rows = [(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps]
-        return cls._shown(scene, np.ascontiguousarray(np.array(rows, dtype=np.float64).T), numbers, caps)
+        rows = np.array([(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps], dtype=np.float64)
+        columns = np.ascontiguousarray(rows.T)
+        columns.setflags(write=False)
+        table = cls._shown(scene, *columns, caps)
+        table.caps[:, 5] = numbers[table.caps[:, 5].astype(np.intp)]
+        return table
 
     @classmethod
     def of_table(cls, scene: CapScene, drops: Drops) -> CapTable:
         """The same of drops in a table, numbered as they come."""
-        index = np.full(len(drops), drops.index)
-        columns = np.array([drops.x, drops.y, drops.radius, drops.contact_angle, index])
-        return cls._shown(scene, columns, np.arange(len(drops)), cast(Sequence[SphericalCap], drops.lazily()))
+        index = np.array([drops.index])
+        index.setflags(write=False)
+        caps = cast(Sequence[SphericalCap], drops.lazily())
+        return cls._shown(scene, drops.x, drops.y, drops.radius, drops.contact_angle, index, caps)
 
     @classmethod
-    def _shown(cls, scene: CapScene, columns: Array, numbers: Indices, caps: Sequence[SphericalCap]) -> CapTable:
+    def _shown(
+        cls, scene: CapScene, x: Array, y: Array, radius: Array, angle: Array, index: Array,
+        caps: Sequence[SphericalCap],
+    ) -> CapTable:  # fmt: skip
         from rainstereo.compiled.cap_outlines import outline
 
-        _check_places(scene, caps, columns)
-        table, circles = np.empty((len(numbers), 6)), np.empty((len(numbers), 3))
-        count = outline(
-            columns, numbers, *scene.place, RING, BETWEEN, (MARGIN, FAR), scene.camera.size, table, circles
+        _check_places(scene, caps, x, y, radius, angle)
+        limits = MARGIN, FAR
+        return cls(
+            scene, *outline(x, y, radius, angle, index, *scene.place, RING, BETWEEN, limits, scene.camera.size)
         )  # fmt: skip
-        return cls._ordered(scene, table[:count], circles[:count])
-
-    @classmethod
-    def _ordered(cls, scene: CapScene, caps: Array, circles: Array) -> CapTable:
-        """With the caps in an order of their own, so that sums do not depend on the one in which they come."""
-        order = np.lexsort(caps[:, :5].T)
-        return cls(scene, caps[order], circles[order])
 
     @classmethod
     def joined(cls, parts: list[CapTable]) -> list[CapTable]:
         """The same in one table for each face."""
+        from rainstereo.compiled.cap_outlines import ordered
+
         found: dict[CapScene, list[CapTable]] = {}
         for part in parts:
             found.setdefault(part.scene, []).append(part)
         return [
-            cls._ordered(
-                scene, np.concatenate([part.caps for part in some]), np.concatenate([part.circles for part in some])
+            cls(
+                scene,
+                *ordered(*(np.concatenate([getattr(part, name) for part in some]) for name in ("caps", "circles"))),
             )
             for scene, some in found.items()
         ]
@@ -229,36 +233,20 @@ class CapTable:
 
     # -- for the loops -------------------------------------------------------------------------------------------------
 
-    @cached_property
+    @property
     def columns(self) -> Array:
         """(N, 7), see `compiled.cap_rays`."""
-        x, y, radius, angle, index, _ = self.caps.T
-        origin = self.scene.lattice.origin
-        place = np.searchsorted(self._indices, index)
-        return np.ascontiguousarray(
-            np.stack(
-                [
-                    origin[0] + x, origin[1] + y, radius * radius, radius / np.tan(angle), np.sin(angle) / radius,
-                    index, place,
-                ],
-                -1,
-            )
-        )  # fmt: skip
+        return self._made[0]
 
-    @cached_property
-    def nodes(self) -> Array:
-        """The lattice, and how drops of each index dim."""
-        return self.scene.nodes(tuple(self._indices.tolist()))
-
-    @cached_property
-    def _indices(self) -> Any:
-        return np.unique(self.caps[:, 4])
-
-    @cached_property
+    @property
     def outlines(self) -> Array:
         """(N, 5), see `compiled.cap_tiles`: circles, and the part of `rivals` that is each cap's."""
-        counts, _ = self._rivals
-        return np.concatenate([self.circles, np.stack([np.cumsum(counts) - counts, counts], -1)], axis=1)
+        return self._made[1]
+
+    @property
+    def nodes(self) -> Array:
+        """The lattice, and how drops of each index dim."""
+        return self.scene.nodes(tuple(self._made[2].tolist()))
 
     @property
     def rivals(self) -> Indices:
@@ -266,20 +254,25 @@ class CapTable:
         return self._rivals[1]
 
     @cached_property
+    def _made(self) -> tuple[Array, Array, Array]:
+        from rainstereo.compiled.cap_outlines import tabulated
+
+        made: tuple[Array, Array, Array] = tabulated(
+            self.caps, self.circles, self._rivals[0], self.scene.lattice.origin
+        )
+        return made
+
+    @cached_property
     def _rivals(self) -> tuple[Indices, Indices]:
         """How many they are, (N,), and their numbers, cap by cap."""
-        x, y, radius = np.ascontiguousarray(self.circles.T)
-        if len(x) <= FEW:
-            from rainstereo.compiled import cap_shares as loops
+        from rainstereo.compiled.cap_outlines import meeting
 
-            counts = np.empty(len(x), dtype=np.int64)
-            loops.count_rivals(x, y, radius, counts)
-            rivals = np.empty(counts.sum(), dtype=np.int64)
-            loops.list_rivals(x, y, radius, counts, rivals)
-            return counts, rivals
-        one, other = touching(x, y, radius)
+        if len(self.caps) <= FEW:
+            found: tuple[Indices, Indices] = meeting(self.circles)
+            return found
+        one, other = touching(*np.ascontiguousarray(self.circles.T))
         one, other = np.concatenate([one, other]), np.concatenate([other, one])
-        return np.bincount(one, minlength=len(x)), other[np.lexsort((other, one))]
+        return np.bincount(one, minlength=len(self.caps)), other[np.lexsort((other, one))]
 
     # -- drawn ---------------------------------------------------------------------------------------------------------
 
@@ -349,20 +342,21 @@ class _Tabulated:
     weights: Array
 
 
-def _check_places(scene: CapScene, caps: Sequence[SphericalCap], columns: Array) -> None:
+def _check_places(
+    scene: CapScene, caps: Sequence[SphericalCap], x: Array, y: Array, radius: Array, angle: Array
+) -> None:
     """ValueError unless the chamber has room for caps on a far face, and the scene lies beyond them.
 
-    columns: (5, N) of the caps, which are looked at only where something is wrong.
+    The caps themselves are looked at only where something is wrong.
     """
-    chamber, panel, (x, y, radius, angle, _) = scene.chamber, scene.panel, columns
-    space = panel_plane.room(chamber, panel, "far")
+    space = panel_plane.room(scene.chamber, scene.panel, "far")
     if math.isfinite(space) and not (radius * np.tan(angle / 2)).max() < space:
         for cap in caps:
             cap.check_room(space)
     if math.isfinite(scene.depth):
         foot, along = scene.place[0], scene.frame.R_panel_cam[:, 2]
         if not scene.depth > foot @ along + (x * along[0] + y * along[1]).max():
-            DropStack(chamber, caps).check_depth(scene.depth)
+            DropStack(scene.chamber, caps).check_depth(scene.depth)
 
 
 def _record(pixels: int, taps: int) -> tuple[Any, ...]:

@@ -172,9 +172,7 @@ def test_own_rays_stand_for_the_light_about_them(radius, angle, steps):
     from rainstereo.compiled.cap_rays import PLANES, SUB, WEIGHT, Y_, fit, of_row
 
     drop = cap(0.4, -0.3, radius, angle)
-    table = CapTable.of(
-        scene_of(CAMERA, PANE, math.inf), [drop], np.zeros(1, np.intp)
-    )
+    table = CapTable.of(scene_of(CAMERA, PANE, math.inf), [drop], np.zeros(1, np.intp))
     tile, line, slopes = np.zeros((5, 3, 3), np.float32), np.zeros(15, np.float32), np.zeros(12, np.float32)
     rays, outline = np.zeros(PLANES * 64, np.float32), table.outlines[0]
     planes, lattice = rays.reshape(-1, 64), table.scene.lattice
