@@ -126,13 +126,13 @@ def meeting(circles: Any) -> Any:
         counts[i] = found
     rivals, at = np.empty(counts.sum(), np.int64), np.uint64(0)
     for i in range(np.uint64(len(x))):
-        stop, j = at + np.uint64(counts[i]), np.uint64(0)
+        other, stop = np.uint64(0), at + np.uint64(counts[i])
         while at < stop:
-            dx, dy, reach = x[i] - x[j], y[i] - y[j], radius[i] + radius[j]
-            if dx * dx + dy * dy < reach * reach and i != j:
-                rivals[at] = j
+            dx, dy, reach = x[i] - x[other], y[i] - y[other], radius[i] + radius[other]
+            if dx * dx + dy * dy < reach * reach and i != other:
+                rivals[at] = other
                 at += np.uint64(1)
-            j += np.uint64(1)
+            other += np.uint64(1)
     return counts, rivals
 
 

@@ -67,7 +67,7 @@ class FaceLattice:
         points, waves = (part @ frame.R_panel_cam.T for part in (rays.origins, rays.directions))
         nodes = np.stack([points[..., 0], points[..., 1], waves[..., 0], waves[..., 1]])
         later, end = _behind(chamber, panel)
-        view = _view(camera, frame, end, depth).astype(np.float32)
+        view: Image = _view(camera, frame, end, depth).astype(np.float32)
         return cls(nodes, later, view, frame.origin(chamber, panel), float(chamber.panels[panel].index))
 
     @property
@@ -185,7 +185,8 @@ class CapTable:
         rows = np.array([(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps], dtype=np.float64)
         columns = np.ascontiguousarray(rows.T)
         columns.setflags(write=False)
-        table = cls._shown(scene, *columns, caps)
+        x, y, radius, angle, index = columns
+        table = cls._shown(scene, x, y, radius, angle, index, caps)
         table.caps[:, 5] = numbers[table.caps[:, 5].astype(np.intp)]
         return table
 
