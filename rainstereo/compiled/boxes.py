@@ -65,13 +65,21 @@ def _mean(a: Any, b: Any, c: Any, d: Any) -> Any:
 
 
 @compiled
-def every_box(image: Any, boxes: Any, starts: Any, widths: Any, octaves: Any) -> None:
+def every_box(image: Any, copy: Any, boxes: Any, starts: Any, widths: Any, octaves: Any) -> None:
     """Boxes of all sizes, (N,), of bytes, (H, W, 1 or 3).
 
+    copy: (H W C,) gets a copy of the image, which is at hand, unless it is empty.
     starts, widths: (L,), where a size's boxes begin and how many are in a row. octaves: (K, 3), see `rain.boxes`.
     """
     cells = np.empty(((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2), np.uint32)
-    halve(image, True, cells.reshape(-1))
+    values, pitch = image.reshape(-1), 2 * image.shape[1] * image.shape[2]
+    for j in range(len(cells)):
+        part = values[pitch * j : pitch * (j + 1)]
+        if len(copy) > 0:
+            some = copy[pitch * j : pitch * (j + 1)]
+            for i in range(np.uint64(len(part))):
+                some[i] = part[i]
+        halve(image[2 * j : 2 * j + 2], True, cells[j])
     widen(cells.reshape(-1))
     first_boxes(cells, _of_size(boxes, starts, widths, 0))
     for each in range(len(octaves)):

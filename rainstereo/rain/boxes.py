@@ -59,12 +59,13 @@ class Boxes:
         steps = [round(1 / float(inverse)) for inverse in self.inverse]
         return [(k, 2 ** (k // 2) // steps[k - 2], steps[k] // steps[k - 2]) for k in range(2, len(steps), 2)]
 
-    def words(self, image: Image) -> Any:
-        """All boxes of bytes, (H, W, 1 or 3), as (count,) uint32."""
+    def words(self, image: Image, copy: Image | None = None) -> Any:
+        """All boxes of bytes, (H, W, 1 or 3), as (count,) uint32; copy: contiguous, gets a copy of the image."""
         from rainstereo.compiled.boxes import every_box
 
         found = np.empty(self.count, dtype=np.uint32)
-        every_box(image, found, self.start, self.width, self._steps)
+        out = np.empty(0, dtype=np.uint8) if copy is None else copy.reshape(-1)
+        every_box(image, out, found, self.start, self.width, self._steps)
         return found
 
     @cached_property

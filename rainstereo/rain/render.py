@@ -200,9 +200,7 @@ class Renderer:
     def _cap_table(self, caps: Sequence[SphericalCap], numbers: Indices) -> CapTable | None:
         """Those caps on one panel's far face that the image shows; None if compiled loops cannot draw them."""
         scene = self._cap_scene(caps[0].panel)
-        if scene is None or min(cap.index for cap in caps) < 1:
-            return None
-        return CapTable.of(scene, caps, numbers)
+        return None if scene is None or min(cap.index for cap in caps) < 1 else CapTable.of(scene, caps, numbers)
 
     def _of_caps(self, groups: Sequence[Group], numbers: Indices) -> list[Any]:
         """Tables of caps on one panel's far face."""
@@ -323,7 +321,11 @@ class Plan:
 
     def apply(self, image: Image) -> Image:
         """A copy of the clear image's frame with drops: (H, W[, 1 to 4]) uint8, uint16 or float32; never changed."""
-        out = self.renderer.framed(image).copy("C")
+        frame = self.renderer.framed(image)
+        sharp = self.tables and not self.layers and not self.renderer.linear_light and frame.shape == image.shape
+        if sharp and isinstance(self._paste_all, PasteMoving) and (drawn := self._paste_all.drawn(image)) is not None:
+            return drawn
+        out = frame.copy("C")
         if not self.tables and not self.layers:
             return out
         if self.renderer.linear_light:

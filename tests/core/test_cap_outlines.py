@@ -11,8 +11,10 @@ from rainstereo.rain import moving_caps
 from rainstereo.rain.drops import Drops
 from rainstereo.rain.moving_caps import FAR, CapScene, CapTable
 from rainstereo.rain.outlines import Outlines
+from rainstereo.rain.paste_moving import PasteMoving
+from rainstereo.rain.render import Renderer
 
-from .test_render import CAMERA, PANE, TWO
+from .test_render import CAMERA, PANE, TWO, photograph
 
 pytestmark = pytest.mark.skipif(not available(), reason="needs numba: pip install rainstereo[fast]")
 
@@ -105,3 +107,22 @@ def test_tables_for_the_loops(few, monkeypatch):
     expected = [origin[0] + u, origin[1] + v, a**2, a / np.tan(angle), np.sin(angle) / a, index, index > 1.4]
     np.testing.assert_allclose(table.columns, np.stack(expected, -1), rtol=1e-13, atol=1e-18)
     assert len(table.nodes) == 6
+
+
+@pytest.mark.parametrize("kind", ["colour", "gray", "one channel", "mirrored", "read-only"])
+def test_a_frame_that_is_copied_on_the_way_is_that_drawn_over_a_copy(kind):
+    colour = photograph()
+    colour = colour if colour.ndim == 3 else np.stack([colour, colour // 2, 255 - colour], -1)
+    image = {"gray": colour[..., 0], "one channel": colour[..., :1], "mirrored": colour[:, ::-1]}.get(kind, colour)
+    image.setflags(write=kind != "read-only")
+    given, plan = image.copy(), Renderer(CAMERA, PANE, moving=True).plan(many(60))
+    scene, expected = np.ascontiguousarray(image), image.copy("C")
+    paste = PasteMoving(plan.tables)
+    paste.paste(scene, expected, expected)
+    assert paste.drawn(image) is not None
+    found = plan.apply(image)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(image, given)
+    assert (found != image).any()
+    assert found.shape == image.shape
+    assert not np.shares_memory(found, image)
