@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from .compile import compiled, inlined
+from .quads import halve
 
 BITS = 10  # of a channel in a word
 FIELD = np.uint32(BITS)
@@ -64,6 +65,38 @@ def _mean(a: Any, b: Any, c: Any, d: Any) -> Any:
 
 
 @compiled
+def every_box(image: Any, copy: Any, boxes: Any, starts: Any, widths: Any, octaves: Any) -> None:
+    """Boxes of all sizes, (N,), of bytes, (H, W, 1 or 3).
+
+    copy: (H W C,) gets a copy of the image, which is at hand, unless it is empty.
+    starts, widths: (L,), where a size's boxes begin and how many are in a row. octaves: (K, 3), see `rain.boxes`.
+    """
+    cells = np.empty(((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2), np.uint32)
+    values, pitch = image.reshape(-1), 2 * image.shape[1] * image.shape[2]
+    for j in range(len(cells)):
+        part = values[pitch * j : pitch * (j + 1)]
+        if len(copy) > 0:
+            some = copy[pitch * j : pitch * (j + 1)]
+            for i in range(np.uint64(len(part))):
+                some[i] = part[i]
+        halve(image[2 * j : 2 * j + 2], True, cells[j])
+    widen(cells.reshape(-1))
+    first_boxes(cells, _of_size(boxes, starts, widths, 0))
+    for each in range(len(octaves)):
+        k, apart, step = octaves[each, 0], octaves[each, 1], octaves[each, 2]
+        next_boxes(
+            _of_size(boxes, starts, widths, k - 2), apart, step, _of_size(boxes, starts, widths, k - 1),
+            _of_size(boxes, starts, widths, k),
+        )  # fmt: skip
+
+
+@inlined
+def _of_size(boxes: Any, starts: Any, widths: Any, k: Any) -> Any:
+    stop = starts[k + 1] if k + 1 < len(starts) else len(boxes)
+    return boxes[starts[k] : stop].reshape((stop - starts[k]) // widths[k], widths[k])
+
+
+@compiled
 def first_boxes(cells: Any, boxes: Any) -> None:
     """Boxes of four pixels, (h + 1, w + 1), from means over 2 x 2, (h, w)."""
     height, width = cells.shape
@@ -80,14 +113,15 @@ def first_boxes(cells: Any, boxes: Any) -> None:
 def next_boxes(boxes: Any, apart: Any, step: Any, between: Any, larger: Any) -> None:
     """Boxes of twice the side, (h, w), and those between, at every 1st or 2nd (`step`) of the places of boxes, (H, W).
 
-    apart: places from the middle of a larger box to those of the four that make it.
+    apart: places from the middle of a larger box to those of the four that make it; even, if not all places are kept.
     """
     height, width = larger.shape
     down, across = boxes.shape[0] - 1, boxes.shape[1] - 1
     first = min(-(-apart // step), width)
     stop = max((across - apart) // step + 1, first)
     stop = min(stop, width)
-    far, wide = np.uint64(apart), np.uint64(stop)
+    far, wide = np.uint64(apart // step), np.uint64(stop)
+    near = boxes if step == 1 else _every_second(boxes)
     for j in range(height):
         one, other = boxes[mirrored(step * j - apart, down)], boxes[mirrored(step * j + apart, down)]
         own, middle, out = boxes[mirrored(step * j, down)], between[j], larger[j]
@@ -98,14 +132,19 @@ def next_boxes(boxes: Any, apart: Any, step: Any, between: Any, larger: Any) -> 
                 a, b = np.uint64(mirrored(at - apart, across)), np.uint64(mirrored(at + apart, across))
                 out[np.uint64(i)] = _mean(one[a], one[b], other[a], other[b])
                 middle[np.uint64(i)] = _either(own[np.uint64(mirrored(at, across))], out[np.uint64(i)], up)
-        if step == 1:
-            for i in range(np.uint64(first), wide):
-                mean = _mean(one[i - far], one[i + far], other[i - far], other[i + far])
-                out[i] = mean
-                middle[i] = _either(own[i], mean, up)
-        else:
-            for i in range(np.uint64(first), wide):
-                at = i + i
-                mean = _mean(one[at - far], one[at + far], other[at - far], other[at + far])
-                out[i] = mean
-                middle[i] = _either(own[at], mean, up)
+        one, other = near[mirrored(step * j - apart, down) // step], near[mirrored(step * j + apart, down) // step]
+        own = near[mirrored(step * j, down) // step]
+        for i in range(np.uint64(first), wide):
+            mean = _mean(one[i - far], one[i + far], other[i - far], other[i + far])
+            out[i] = mean
+            middle[i] = _either(own[i], mean, up)
+
+
+@inlined
+def _every_second(boxes: Any) -> Any:
+    """Of every second row, side by side."""
+    found = np.empty(((boxes.shape[0] + 1) // 2, (boxes.shape[1] + 1) // 2), np.uint32)
+    for j in range(np.uint64(found.shape[0])):
+        for i in range(np.uint64(found.shape[1])):
+            found[j, i] = boxes[j + j, i + i]
+    return found

@@ -52,7 +52,7 @@ def test_rays_of_a_tile_are_those_of_the_tracer(view, place, radius, angle):
     limit = 5e-3 if view == "distorted" else 3e-4
     drop, scene = cap(*place, radius, angle), scene_of(camera, chamber, depth)
     outlines = Outlines.of([drop], camera, chamber)
-    table = CapTable.of(scene, [drop], outlines, np.zeros(1, np.intp))
+    table = CapTable.of(scene, [drop], np.zeros(1, np.intp))
     u, v = int(outlines.x[0]), int(outlines.y[0])
     tile, line = np.zeros((5, 3, 3), np.float32), np.zeros(15, np.float32)
     rays = np.zeros(PLANES * 64, np.float32)
@@ -172,9 +172,7 @@ def test_own_rays_stand_for_the_light_about_them(radius, angle, steps):
     from rainstereo.compiled.cap_rays import PLANES, SUB, WEIGHT, Y_, fit, of_row
 
     drop = cap(0.4, -0.3, radius, angle)
-    table = CapTable.of(
-        scene_of(CAMERA, PANE, math.inf), [drop], Outlines.of([drop], CAMERA, PANE), np.zeros(1, np.intp)
-    )
+    table = CapTable.of(scene_of(CAMERA, PANE, math.inf), [drop], np.zeros(1, np.intp))
     tile, line, slopes = np.zeros((5, 3, 3), np.float32), np.zeros(15, np.float32), np.zeros(12, np.float32)
     rays, outline = np.zeros(PLANES * 64, np.float32), table.outlines[0]
     planes, lattice = rays.reshape(-1, 64), table.scene.lattice
