@@ -21,7 +21,8 @@ from .cap_edges import (
     slopes_of_row,
     trace_own,
 )
-from .cap_light import draw_light, room_for_light, take_light
+from .cap_light import TOGETHER as TOGETHER_LIGHT
+from .cap_light import draw_light, note_light, room_for_light
 from .cap_looks import is_whole, show_alone
 from .cap_patches import PLACES, show_whole, whole_of_row
 from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
@@ -131,9 +132,13 @@ def frame(
                     alone = every & ~above(rays, SIZE, -HALF)
                     every, fine = every & ~alone, fine & ~alone
                     if not tiny:
-                        waiting = take_light(
-                            s, t, u1, v, low, high, rays, width, scene.shape[2], light, waiting, words, starts,
-                            last, shift, border, cap, outline, tile, u0, v0, later, view, out,
+                        waiting = note_light(
+                            s, t, v * width + u1, scene.shape[2], low, high, rays, light, waiting,
+                        )  # fmt: skip
+                    if waiting >= TOGETHER_LIGHT:
+                        waiting = draw_light(
+                            waiting, words, starts, last, shift, border, cap, outline, tile, u0, v0, later, view,
+                            scene.shape[2], light, out,
                         )  # fmt: skip
                     made = own_of_row(
                         words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,

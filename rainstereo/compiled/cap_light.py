@@ -54,6 +54,7 @@ from .llvm import FOUR, LONG, alike, arguments, ir, load, store
 from .prefetch import to_read
 
 TOGETHER = 16  # pixels whose rays are traced before the first of them are summed
+ROOM = TOGETHER + 64  # for pixels
 BEAMS = np.uint64(PLANES * 64)
 HALVES = RAYS * WIDE // 64
 """How often the rays of eight pixels fill all planes."""
@@ -103,14 +104,14 @@ def _traced(
 ) -> Any:  # fmt: skip
     """traced(rays, pack, first, tile, square, depth, curvature, q, u, v): the rays of eight pixels, behind the cap.
 
-    rays: `HALVES` times all planes; a ray's lanes are the pixels. pack: (2, `TOGETHER`) float32 of pixels' places on
-    the tile, along and down; first: of the eight. u, v: the outline's middle, on the tile.
+    rays: `HALVES` times all planes; a ray's lanes are the pixels. pack: (4, `ROOM`) float32: of pixels the places on
+    the tile, along and down, the share that is hidden, and, written, that over the sum of their rays' shares; first: of the eight. u, v: the outline's middle, on the tile.
     """
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         data, places, first, polynomials, *numbers = arguments(context, builder, signature, given)
         square, depth, curvature, q, u, v = (Lanes.of(builder, number) for number in numbers)
-        s, t, hidden = (Lanes.at(builder, places, builder.add(first, LONG(TOGETHER * k))) for k in range(3))
+        s, t, hidden = (Lanes.at(builder, places, builder.add(first, LONG(ROOM * k))) for k in range(3))
         (x, xs, xt), (y, ys, yt), (a, as_, at), (b, bs, bt), (dim, _, _) = (
             _on_tile(builder, polynomials, plane, s, t) for plane in range(5)
         )
@@ -198,7 +199,7 @@ def _traced(
         summed_up = _over_looks(builder, wide, high, behind)
         _over_looks(builder, wide, high, through)
         unit = hidden * RAYS / summed_up.where(summed_up.above(0.0), 1.0)
-        unit.put(places, builder.add(first, LONG(3 * TOGETHER)))
+        unit.put(places, builder.add(first, LONG(3 * ROOM)))
         return context.get_dummy_value()
 
     long, real = types.uint64, types.float32
@@ -241,15 +242,13 @@ summed: Any = _summed
 
 
 @fused_part
-def take_light(
-    s: Any, t: Any, u: Any, v: Any, low: Any, high: Any, rays: Any, width: Any, channels: Any, light: Any,
-    made: Any, words: Any, starts: Any, last: Any, shift: Any, border: Any, cap: Any, outline: Any, tile: Any, u0: Any,
-    v0: Any, later: Any, view: Any, out: Any,
+def note_light(
+    s: Any, t: Any, first: Any, channels: Any, low: Any, high: Any, rays: Any, light: Any, count: Any
 ) -> Any:  # fmt: skip
-    """Note those pixels of a row that need rays of their own, and lie inside the contact circle and no other cap; take
-    them out of `HIDDEN`; draw them as soon as there are `TOGETHER`. Returns how many are left; made: how many were.
+    """Note those pixels of a row that need rays of their own and that no other cap shares, after `count` others on its
+    tile, and take them out of `HIDDEN`. Returns how many there are.
 
-    s, t: pixels from the tile's own to lane 0; u, v: its column and row.
+    s, t: pixels from the tile's own to lane 0. first: number of its pixel.
     """
     places, pixels = light[1], light[2]
     for j in range(np.uint64(64)):
@@ -260,63 +259,89 @@ def take_light(
         j = lowest(left)
         left &= left - np.uint64(1)
         lane = np.int64(j)
-        places[made], places[made + TOGETHER] = s + np.float32(lane), t
-        places[made + 2 * TOGETHER] = rays[HIDDEN + j]
+        places[count], places[count + ROOM], places[count + 2 * ROOM] = s + np.float32(lane), t, rays[HIDDEN + j]
         rays[HIDDEN + j] = ZERO
-        pixels[made] = ((v * width + u) + lane) * channels
-        made += 1
-        if made == TOGETHER:
-            draw_light(
-                made, words, starts, last, shift, border, cap, outline, tile, u0, v0, later, view, channels, light, out,
-            )  # fmt: skip
-            made = 0
-    return made
+        pixels[count] = (first + lane) * channels
+        count += 1
+    return count
+
+
+@fused
+def trace_light(
+    cap: Any, outline: Any, tile: Any, u0: Any, v0: Any, later: Any, view: Any, places: Any, first: Any, beams: Any
+) -> None:  # fmt: skip
+    """The rays of eight of the pixels that have been noted, from `first` on, to the planes `SUB`, and to `WEIGHT` what
+    each has of its pixel's light.
+
+    u0, v0: the tile's own pixel. beams: `HALVES` times all planes; a ray's lanes are the pixels.
+    """
+    square, depth = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH])
+    curvature, q = np.float32(cap[CAP_CURVATURE]), np.float32(cap[CAP_INDEX]) * np.float32(cap[CAP_INDEX])
+    u, v = np.float32(outline[OUT_X]) - u0, np.float32(outline[OUT_Y]) - v0
+    traced(beams, places, np.uint64(first), tile, square, depth, curvature, q, u, v)
+    for half in range(HALVES):
+        rays = beams[half * PLANES * 64 : (half + 1) * PLANES * 64]
+        onward(cap, later, view, rays, np.uint64(0), np.uint64(64), SUB)
+        for j in range(np.uint64(64)):
+            rays[WEIGHT + j] = rays[SUB + GAIN + j] * rays[SHARE + j]
+
+
+@fused_part
+def call_light(
+    words: Any, starts: Any, last: Any, shift: Any, border: Any, outline: Any, beams: Any, light: Any, to: Any
+) -> None:  # fmt: skip
+    """Find the boxes that rays which have been traced look at, and call for them; numbers and weights from `to` on."""
+    at, weights, boxes = light[3], light[4], light[6]
+    bits, rest, none = np.uint64(SIZE_BITS), np.uint64((1 << SIZE_BITS) - 1), np.uint64(NO_BOX)
+    for half in range(HALVES):
+        rays = beams[half * PLANES * 64 : (half + 1) * PLANES * 64]
+        boxes_of_rays(outline, last, shift, border, len(starts), rays, 64, boxes)
+        for j in range(np.uint64(64)):
+            size = np.uint64(boxes[j]) >> bits
+            number = np.uint64(starts[np.uint64(0) if size == none else size]) + (np.uint64(boxes[j]) & rest)
+            to_read(words, number)
+            at[to + j] = np.uint32(number)
+            weights[to + j] = rays[WEIGHT + j]
+        to += np.uint64(64)
 
 
 @fused
 def draw_light(
     count: Any, words: Any, starts: Any, last: Any, shift: Any, border: Any, cap: Any, outline: Any, tile: Any,
     u0: Any, v0: Any, later: Any, view: Any, channels: Any, light: Any, out: Any,
-) -> None:  # fmt: skip
-    """Draw the first `count` of the pixels that have been noted, all on one tile."""
-    beams, places, pixels, at, weights, shown, boxes = light
-    for k in range(count, TOGETHER):
-        for plane in range(0, 3 * TOGETHER, TOGETHER):
+) -> Any:  # fmt: skip
+    """Draw pixels that have been noted, all on one tile: `count`, or, if they are many, whole vectors of them. Returns
+    how many are left, and noted anew."""
+    beams, places, pixels, at, weights, shown, _ = light
+    left = count % WIDE if count >= TOGETHER else 0
+    stop, nothing = np.uint64(count - left), np.uint64(0)
+    for k in range(count, (count + WIDE - 1) // WIDE * WIDE):  # a vector is filled up with what is there
+        for plane in range(0, 3 * ROOM, ROOM):
             places[k + plane] = places[count - 1 + plane]
-    square, depth = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH])
-    curvature, q = np.float32(cap[CAP_CURVATURE]), np.float32(cap[CAP_INDEX]) * np.float32(cap[CAP_INDEX])
-    u, v = np.float32(outline[OUT_X]) - u0, np.float32(outline[OUT_Y]) - v0
-    bits, rest, none = np.uint64(SIZE_BITS), np.uint64((1 << SIZE_BITS) - 1), np.uint64(NO_BOX)
-    nothing, stop = np.uint64(0), np.uint64(count)
-    for first in range(nothing, stop, EIGHT):
-        traced(beams, places, first, tile, square, depth, curvature, q, u, v)
-        for half in range(HALVES):
-            rays = beams[half * PLANES * 64 : (half + 1) * PLANES * 64]
-            onward(cap, later, view, rays, nothing, np.uint64(64), SUB)
-            for j in range(np.uint64(64)):
-                rays[WEIGHT + j] = rays[SUB + GAIN + j] * rays[SHARE + j]
-            boxes_of_rays(outline, last, shift, border, len(starts), rays, 64, boxes)
-            to = first * np.uint64(RAYS) + np.uint64(64 * half)
-            for j in range(np.uint64(64)):
-                size = np.uint64(boxes[j]) >> bits
-                number = np.uint64(starts[nothing if size == none else size]) + (np.uint64(boxes[j]) & rest)
-                to_read(words, number)
-                at[to + j] = np.uint32(number)
-                weights[to + j] = rays[WEIGHT + j]
-    for first in range(nothing, stop, EIGHT):
-        summed(words, at, weights, first * np.uint64(RAYS), shown)
-        for k in range(first, min(first + EIGHT, stop)):
-            clear, unit = ONE - places[k + np.uint64(2 * TOGETHER)], places[k + np.uint64(3 * TOGETHER)]
-            for channel in range(np.uint64(channels)):
-                number = np.uint64(pixels[k]) + channel
-                value = shown[EIGHT * channel + k - first] * unit + clear * np.float32(out[number]) + HALF
-                out[number] = np.uint8(np.int32(value if value < WHITE else WHITE))
+    for begin in range(nothing, stop, np.uint64(TOGETHER)):
+        end = min(begin + np.uint64(TOGETHER), stop)
+        for first in range(begin, end, EIGHT):
+            trace_light(cap, outline, tile, u0, v0, later, view, places, first, beams)
+            call_light(words, starts, last, shift, border, outline, beams, light, (first - begin) * np.uint64(RAYS))
+        for first in range(begin, end, EIGHT):
+            summed(words, at, weights, (first - begin) * np.uint64(RAYS), shown)
+            for k in range(first, min(first + EIGHT, end)):
+                clear, unit = ONE - places[k + np.uint64(2 * ROOM)], places[k + np.uint64(3 * ROOM)]
+                for channel in range(np.uint64(channels)):
+                    number = np.uint64(pixels[k]) + channel
+                    value = shown[EIGHT * channel + k - first] * unit + clear * np.float32(out[number]) + HALF
+                    out[number] = np.uint8(np.int32(value if value < WHITE else WHITE))
+    for k in range(left):
+        pixels[k] = pixels[stop + np.uint64(k)]
+        for plane in range(0, 3 * ROOM, ROOM):
+            places[k + plane] = places[stop + np.uint64(k + plane)]
+    return left
 
 
 def room_for_light() -> tuple[Any, ...]:
     """Beams, places, addresses, numbers of boxes, weights, what is shown, and numbers of boxes of 64 rays."""
     return (
-        np.zeros(int(BEAMS) * HALVES, np.float32), np.zeros(4 * TOGETHER, np.float32), np.zeros(TOGETHER, np.int64),
+        np.zeros(int(BEAMS) * HALVES, np.float32), np.zeros(4 * ROOM, np.float32), np.zeros(ROOM, np.int64),
         np.zeros(TOGETHER * RAYS, np.uint32), np.zeros(TOGETHER * RAYS, np.float32), np.zeros(3 * WIDE, np.float32),
         np.zeros(64, np.uint32),
     )  # fmt: skip
