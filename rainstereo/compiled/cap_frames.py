@@ -133,7 +133,7 @@ def frame(
                     every, fine = every & ~alone, fine & ~alone
                     if not tiny:
                         waiting = note_light(
-                            s, t, v * width + u1, scene.shape[2], low, high, rays, light, waiting,
+                            s, t, v * width + u1, scene.shape[2], low, high, hangs, rays, light, waiting,
                         )  # fmt: skip
                     if waiting >= TOGETHER_LIGHT:
                         waiting = draw_light(

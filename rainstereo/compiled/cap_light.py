@@ -158,10 +158,13 @@ def _traced(
         # how far within the contact circle a ray is, in parts of what it stands for: along a tangent, as in `cap_shares`
         gx, gy, reach = x * xs + y * ys, x * xt + y * yt, (x * x + y * y).root()
         radius = square.root()
-        within = (radius - reach) * reach - (gx * gx + gy * gy) * float(SAGITTA) / (radius * reach)
+        within, most = (radius - reach) * reach, gx.size() + gy.size()
+        near = (most + most - within).above(0.0)
+        within = within - (gx * gx + gy * gy) * float(SAGITTA) / (radius * reach)
         one, other = gx * wide, gy * high
         per_part = 1.0 / (one * one + other * other).root()  # a line's mean slope across a rectangle
-        within, gx, gy = (within * per_part + 0.5).where((1.0 - hidden).above(0.0), 1e9), gx * per_part, gy * per_part
+        within = (within * per_part + 0.5).where(near, 1.0)
+        gx, gy = (gx * per_part).where(near), (gy * per_part).where(near)
         far = far_x * far_x + far_y * far_y
         box = float(WIDER * SMALLEST) / RAYS / far.where(far.above(1.0), 1.0)
         dim = dim * (1 / RAYS)
@@ -198,8 +201,10 @@ def _traced(
 
         summed_up = _over_looks(builder, wide, high, behind)
         _over_looks(builder, wide, high, through)
+        place = builder.add(first, LONG(3 * ROOM))
+        hangs = Lanes.at(builder, places, place).above(0.0)
         unit = hidden * RAYS / summed_up.where(summed_up.above(0.0), 1.0)
-        unit.put(places, builder.add(first, LONG(3 * ROOM)))
+        (unit * 0.0 + 1.0).where(hangs, unit).put(places, place)
         return context.get_dummy_value()
 
     long, real = types.uint64, types.float32
@@ -243,7 +248,7 @@ summed: Any = _summed
 
 @fused_part
 def note_light(
-    s: Any, t: Any, first: Any, channels: Any, low: Any, high: Any, rays: Any, light: Any, count: Any
+    s: Any, t: Any, first: Any, channels: Any, low: Any, high: Any, hangs: bool, rays: Any, light: Any, count: Any
 ) -> Any:  # fmt: skip
     """Note those pixels of a row that need rays of their own and that no other cap shares, after `count` others on its
     tile, and take them out of `HIDDEN`. Returns how many there are.
@@ -260,6 +265,7 @@ def note_light(
         left &= left - np.uint64(1)
         lane = np.int64(j)
         places[count], places[count + ROOM], places[count + 2 * ROOM] = s + np.float32(lane), t, rays[HIDDEN + j]
+        places[count + 3 * ROOM] = ONE if hangs else ZERO
         rays[HIDDEN + j] = ZERO
         pixels[count] = (first + lane) * channels
         count += 1
@@ -316,7 +322,7 @@ def draw_light(
     left = count % WIDE if count >= TOGETHER else 0
     stop, nothing = np.uint64(count - left), np.uint64(0)
     for k in range(count, (count + WIDE - 1) // WIDE * WIDE):  # a vector is filled up with what is there
-        for plane in range(0, 3 * ROOM, ROOM):
+        for plane in range(0, 4 * ROOM, ROOM):
             places[k + plane] = places[count - 1 + plane]
     for begin in range(nothing, stop, np.uint64(TOGETHER)):
         end = min(begin + np.uint64(TOGETHER), stop)
@@ -333,7 +339,7 @@ def draw_light(
                     out[number] = np.uint8(np.int32(value if value < WHITE else WHITE))
     for k in range(left):
         pixels[k] = pixels[stop + np.uint64(k)]
-        for plane in range(0, 3 * ROOM, ROOM):
+        for plane in range(0, 4 * ROOM, ROOM):
             places[k + plane] = places[stop + np.uint64(k + plane)]
     return left
 
