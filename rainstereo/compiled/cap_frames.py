@@ -25,7 +25,7 @@ from .cap_light import TOGETHER as TOGETHER_LIGHT
 from .cap_light import draw_light, note_light, room_for_light
 from .cap_looks import is_whole, show_alone
 from .cap_patches import PLACES, show_whole, whole_of_row
-from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
+from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit
 from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
 from .cap_tiles import (
@@ -114,7 +114,6 @@ def frame(
                     shares_of_row(tile, t, s, lanes, low, high, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
                         taken(tile, t, s, u1, v, lanes, wide, caps, number, rivals, outlines, line, rays)
-                    of_row(tile, t, line)
                     slopes_of_row(tile, t, slopes)
                     share_out(rays, begin, end)
                     if mode != DRAW:

@@ -43,6 +43,7 @@ from .cap_rays import (
     SUB,
     WEIGHT,
     ONE,
+    Y_,
     ZERO,
     onward,
 )
@@ -290,6 +291,28 @@ def trace_light(
         onward(cap, later, view, rays, np.uint64(0), np.uint64(64), SUB)
         for j in range(np.uint64(64)):
             rays[WEIGHT + j] = rays[SUB + GAIN + j] * rays[SHARE + j]
+
+
+@fused
+def one_light(
+    s: Any, t: Any, hidden: Any, hangs: bool, cap: Any, outline: Any, tile: Any, u0: Any, v0: Any, last: Any, shift: Any,
+    border: Any, sizes: Any, later: Any, view: Any, rays: Any, at: Any, light: Any,
+) -> None:  # fmt: skip
+    """The rays of one such pixel, s, t from the tile's own, lanes from 0 on; and their boxes, see `boxes_of_rays`."""
+    beams, places = light[0], light[1]
+    for k in range(WIDE):
+        places[k], places[k + ROOM], places[k + 2 * ROOM] = s, t, hidden
+        places[k + 3 * ROOM] = ONE if hangs else ZERO
+    trace_light(cap, outline, tile, u0, v0, later, view, places, 0, beams)
+    for k in range(np.uint64(RAYS)):
+        j = k // EIGHT * BEAMS + k % EIGHT * EIGHT
+        rays[SUB + k], rays[SUB + Y_ + k] = beams[SUB + j], beams[SUB + Y_ + j]
+        rays[PER + k], rays[STRETCH + k] = beams[PER + j], beams[STRETCH + j]
+        rays[WEIGHT + k] = beams[WEIGHT + j] * places[3 * ROOM]
+    boxes_of_rays(outline, last, shift, border, sizes, rays, RAYS, at)
+    for k in range(RAYS):
+        if at[k] >> np.uint32(SIZE_BITS) == NO_BOX:
+            at[k] &= np.uint32((1 << SIZE_BITS) - 1)
 
 
 @fused_part

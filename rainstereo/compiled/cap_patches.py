@@ -174,16 +174,19 @@ def _turned(middle: Lanes, last: Lanes) -> Lanes:
     """Middles of patches between -last and last: beyond its edges a mirrored scene repeats itself every 2 last."""
     turn = last + last
     turns = (middle / turn.where(turn.above(1e-3), 1.0) + 0.5).floor()
-    return middle - turns * turn
+    middle = middle - turns * turn
+    return middle.where((last - middle.size()).above(-1.0))  # what is too far to be told: anywhere
 
 
 def _folded(at: Lanes, last: Lanes, border: int) -> Lanes:
     """Coordinates brought between 0 and `last`, as `cap_looks.folded` does, no farther than that from a middle that is
-    `_turned`."""
+    `_turned`; those between as they are."""
     if border == INSIDE:
         return at
     if border == MIRROR:
-        at = last - (last - at.size()).size()
+        at = at.size()
+        over = at - last
+        return at - over.where(over.above(0.0)) * 2.0
     at = at.where(at.above(0.0), 0.0)
     return last.where(at.above(last), at)
 
