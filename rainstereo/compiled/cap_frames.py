@@ -22,11 +22,11 @@ from .cap_edges import (
     trace_own,
 )
 from .cap_light import TOGETHER as TOGETHER_LIGHT
-from .cap_light import draw_light, note_light, room_for_light
+from .cap_light import draw_light, note_light, one_light, room_for_light
 from .cap_looks import is_whole, show_alone
 from .cap_patches import PLACES, show_whole, whole_of_row
 from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit
-from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
+from .cap_records import PIXELS, TAPS, add_places, record_light, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
 from .cap_tiles import (
     AXX,
@@ -36,6 +36,7 @@ from .cap_tiles import (
     CX,
     CY,
     FAR,
+    LITS,
     OUT_RADIUS,
     OUT_RIVALS,
     SIZE,
@@ -118,9 +119,9 @@ def frame(
                     share_out(rays, begin, end)
                     if mode != DRAW:
                         record_row(
-                            mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, edge, caps,
-                            outlines, later, view, line, slopes, (scene.shape[1], scene.shape[0]), starts, pitches,
-                            inverses, border, shift, rays, at, total, len(words), width, record,
+                            mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, t, u0, v0,
+                            tile, edge, caps, outlines, later, view, line, slopes, (scene.shape[1], scene.shape[0]),
+                            starts, pitches, inverses, border, shift, rays, at, light, total, len(words), width, record,
                         )  # fmt: skip
                         continue
                     for j in range(np.uint64(3 * 64)):
@@ -164,9 +165,9 @@ def frame(
 @fused
 def record_row(
     filling: bool, u: Any, v: Any, number: Any, lanes: Any, low: Any, high: Any, begin: Any, end: Any, tiny: bool,
-    hangs: bool, s: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
+    hangs: bool, s: Any, t: Any, u0: Any, v0: Any, tile: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
     line: Any, slopes: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any,
-    rays: Any, at: Any, mean: Any, boxes: Any, width: Any, record: Any,
+    rays: Any, at: Any, light: Any, mean: Any, boxes: Any, width: Any, record: Any,
 ) -> None:  # fmt: skip
     """Count, or write down, a row's pixels. u, v: column of lane 0, and row. boxes: how many there are."""
     pixels, of_caps, taps, clear, moved, unknown, texels, weights, cursor = record
@@ -186,6 +187,14 @@ def record_row(
             mean[1] = rays[CY + j] - shift[1] + (rays[AYY + j] + rays[BYY + j]) * bend
             mean[2] = ONE
             off = not rays[FAR + j] >= ZERO
+        elif low <= lane < high and rays[LITS + j] == ONE and not rays[RIVAL + j] > ZERO and not tiny:
+            one_light(
+                s + np.float32(lane), t, rays[HIDDEN + j], hangs, caps[number], outlines[number], tile, u0, v0, later,
+                view, rays, light,
+            )  # fmt: skip
+            off = add_places(rays, shift, last, mean)
+            boxes_of_rays(outlines[number], last, shift, border, len(starts), rays, RAYS, at)
+            record_light(starts, rays, at, texels, weights, cursor, filling)
         elif low <= lane < high and has_own(rays, lane, tiny):
             rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
             near = bool(rival >= 0 or not rays[ROOM + j] > edge)

@@ -295,10 +295,10 @@ def trace_light(
 
 @fused
 def one_light(
-    s: Any, t: Any, hidden: Any, hangs: bool, cap: Any, outline: Any, tile: Any, u0: Any, v0: Any, last: Any, shift: Any,
-    border: Any, sizes: Any, later: Any, view: Any, rays: Any, at: Any, light: Any,
+    s: Any, t: Any, hidden: Any, hangs: bool, cap: Any, outline: Any, tile: Any, u0: Any, v0: Any, later: Any,
+    view: Any, rays: Any, light: Any,
 ) -> None:  # fmt: skip
-    """The rays of one such pixel, s, t from the tile's own, lanes from 0 on; and their boxes, see `boxes_of_rays`."""
+    """The rays of one such pixel, lanes from 0 on, as `trace_own` leaves them; hidden: the share that its cap hides."""
     beams, places = light[0], light[1]
     for k in range(WIDE):
         places[k], places[k + ROOM], places[k + 2 * ROOM] = s, t, hidden
@@ -309,10 +309,13 @@ def one_light(
         rays[SUB + k], rays[SUB + Y_ + k] = beams[SUB + j], beams[SUB + Y_ + j]
         rays[PER + k], rays[STRETCH + k] = beams[PER + j], beams[STRETCH + j]
         rays[WEIGHT + k] = beams[WEIGHT + j] * places[3 * ROOM]
-    boxes_of_rays(outline, last, shift, border, sizes, rays, RAYS, at)
-    for k in range(RAYS):
-        if at[k] >> np.uint32(SIZE_BITS) == NO_BOX:
-            at[k] &= np.uint32((1 << SIZE_BITS) - 1)
+
+
+@fused_part
+def box_of(box: Any, starts: Any) -> Any:
+    """The number among all of a box from `boxes_of_rays`; the smallest there is where it is the image itself."""
+    size, rest = np.uint64(box) >> np.uint64(SIZE_BITS), np.uint64(box) & np.uint64((1 << SIZE_BITS) - 1)
+    return np.uint64(starts[np.uint64(0) if size == np.uint64(NO_BOX) else size]) + rest
 
 
 @fused_part
@@ -321,13 +324,11 @@ def call_light(
 ) -> None:  # fmt: skip
     """Find the boxes that rays which have been traced look at, and call for them; numbers and weights from `to` on."""
     at, weights, boxes = light[3], light[4], light[6]
-    bits, rest, none = np.uint64(SIZE_BITS), np.uint64((1 << SIZE_BITS) - 1), np.uint64(NO_BOX)
     for half in range(HALVES):
         rays = beams[half * PLANES * 64 : (half + 1) * PLANES * 64]
         boxes_of_rays(outline, last, shift, border, len(starts), rays, 64, boxes)
         for j in range(np.uint64(64)):
-            size = np.uint64(boxes[j]) >> bits
-            number = np.uint64(starts[np.uint64(0) if size == none else size]) + (np.uint64(boxes[j]) & rest)
+            number = box_of(boxes[j], starts)
             to_read(words, number)
             at[to + j] = np.uint32(number)
             weights[to + j] = rays[WEIGHT + j]
