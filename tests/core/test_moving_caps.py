@@ -45,8 +45,7 @@ def scene_of(camera: Camera, chamber: Chamber, depth: float) -> CapScene:
 )
 def test_rays_of_a_tile_are_those_of_the_tracer(view, place, radius, angle):
     """In ten-thousandths of a pixel of the frame, where the lens does not bend the lattice much."""
-    from rainstereo.compiled.cap_rays import GAIN, OWN, PLANES, Y_, fit
-    from rainstereo.compiled.cap_tiles import trace_lanes
+    from rainstereo.compiled.cap_rays import GAIN, OWN, PLANES, Y_, cross, fit, of_row, take_up
 
     camera, chamber, depth = VIEWS[view]
     limit = 5e-3 if view == "distorted" else 3e-4
@@ -62,7 +61,9 @@ def test_rays_of_a_tile_are_those_of_the_tracer(view, place, radius, angle):
     errors: list[float] = []
     for row in (-9.5, -3.0, 0.0, 4.5, 11.0):
         t, s = np.float32(v + row - v0), np.float32(u - 20.5 - u0)
-        trace_lanes(tile, t, s, 0, 40, table.columns[0], scene.lattice.later, scene.lattice.view, line, rays, OWN)
+        of_row(tile, t, line)
+        take_up(line, s, 0, 40, rays)
+        cross(table.columns[0], scene.lattice.later, scene.lattice.view, rays, 0, 40, OWN, False)
         pixels = np.stack([u - 20.5 + np.arange(40), np.full(40, v + row)], -1)
         seen = trace(pixels, drop, camera, chamber, depth)
         expected = seen.transmittance / clear_transmittance(pixels, camera, chamber)
