@@ -149,7 +149,8 @@ def frame(
                     while alone:
                         show_alone(scene, last, border, rays, lowest(alone), total)
                         alone &= alone - ONE_LANE
-                    write_bytes(out, width, scene.shape[2], v, u1, lanes, rays)
+                    some = (0, lanes) if hangs else (low // 8 * 8, high)  # nothing is hidden beyond
+                    write_bytes(out, width, scene.shape[2], v, u1, some, rays)
                 if waiting > 0:
                     draw_light(
                         waiting, words, starts, last, shift, border, cap, outline, tile, u0, v0, later, view,
@@ -242,20 +243,23 @@ def call_for(out: Any, width: Any, channels: Any, v: Any, stop: Any, u: Any, lan
 
 
 @fused_part
-def write_bytes(out: Any, width: Any, of_pixel: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
-    """Mix what a row shows with what is there, where a cap hides it."""
+def write_bytes(out: Any, width: Any, of_pixel: Any, v: Any, u: Any, some: Any, rays: Any) -> None:
+    """Mix what lanes of a row show, some[0] to before some[1], with what is there, where a cap hides it."""
     channels, three, block = np.uint64(of_pixel), np.uint64(3), np.uint64(32)
-    first, stop = np.uint64((v * width + u) * of_pixel), np.uint64((v + 1) * width * of_pixel)
+    start, stop = np.uint64(some[0]), np.uint64(some[1])
+    first, last = np.uint64((v * width + u) * of_pixel), np.uint64((v + 1) * width * of_pixel)
     if channels == three:
-        count = (three * np.uint64(lanes) + block - np.uint64(1)) // block * block  # whole vectors
-        for j in range(np.uint64(0), (count + three - np.uint64(1)) // three, EIGHT):  # beyond the lanes, all is clear
+        begin, count = three * start, (three * (stop - start) + block - np.uint64(1)) // block * block  # whole vectors
+        for j in range(start, start + (count + three - np.uint64(1)) // three, EIGHT):  # beyond the lanes, all is clear
             thrice(rays, HIDDEN + j, COVER + three * j)
-        for k in range(min(count, stop - first)):
+        for k in range(begin, min(begin + count, last - first)):
             value = rays[SHOWN + k] + (ONE - rays[COVER + k]) * np.float32(out[first + k]) + HALF
             out[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))
         return
-    for j in range(np.uint64(lanes)):
+    for j in range(start, stop):
         for channel in range(channels):
             k, at = three * j + channel, first + j * channels + channel
             value = rays[SHOWN + k] + (ONE - rays[HIDDEN + j]) * np.float32(out[at]) + HALF
             out[at] = np.uint8(np.int32(value if value < WHITE else WHITE))
+
+
