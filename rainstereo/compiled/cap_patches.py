@@ -68,7 +68,7 @@ def _placed(fine: bool, border: int) -> Any:
         builder.branch(loop)
         builder.position_at_end(loop)
         done, s, t = builder.phi(LONG), Lanes(builder, builder.phi(REALS)), Lanes(builder, builder.phi(REALS))
-        at = []
+        known, at = builder.phi(LONG), []
         for (c, a, b, aa, bb, ab), end in zip(axes, lasts, strict=True):
             place = (c + t * (b + t * (bb * 0.5))) + s * (a + s * (aa * 0.5) + t * ab)
             at.append(builder.fptosi((_folded(place, end, border) + middle).value, WORDS))
@@ -80,8 +80,8 @@ def _placed(fine: bool, border: int) -> Any:
         box = builder.add(builder.add(start, at[0]), builder.mul(at[1], pitch))
         box = builder.select(chosen, box, alike(WORDS, 0))
         store(builder, box, boxes, here)
-        for each in range(WIDE):
-            number = builder.load(builder.gep(boxes, [builder.add(here, LONG(each))]))
+        for each in range(WIDE):  # those of the look before: to read them is quicker than to take a vector apart
+            number = builder.load(builder.gep(boxes, [builder.add(known, LONG(each))]))
             call(builder, words, builder.zext(number, LONG))
             if fine:
                 below = builder.add(number, builder.extract_element(pitch, FOUR(each)))
@@ -93,6 +93,7 @@ def _placed(fine: bool, border: int) -> Any:
         builder.cbranch(builder.icmp_unsigned("<", count, looks), loop, after)
         for phi, begun, coming in (
             (done, LONG(0), count), (s.value, left.value, next_s.value), (t.value, top.value, next_t.value),
+            (known, first, here),
         ):  # fmt: skip
             phi.add_incoming(begun, before)
             phi.add_incoming(coming, loop)
