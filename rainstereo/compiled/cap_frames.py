@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .cap_beams import TOGETHER as TOGETHER_LIGHT
 from .cap_edges import (
     RAYS,
     TOGETHER,
@@ -21,7 +22,6 @@ from .cap_edges import (
     slopes_of_row,
     trace_own,
 )
-from .cap_light import TOGETHER as TOGETHER_LIGHT
 from .cap_light import draw_light, note_light, one_light, room_for_light
 from .cap_looks import is_whole, show_alone
 from .cap_patches import PLACES, show_whole, whole_of_row
@@ -166,9 +166,9 @@ def frame(
 @fused
 def record_row(
     filling: bool, u: Any, v: Any, number: Any, lanes: Any, low: Any, high: Any, begin: Any, end: Any, tiny: bool,
-    hangs: bool, s: Any, t: Any, u0: Any, v0: Any, tile: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
-    line: Any, slopes: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any,
-    rays: Any, at: Any, light: Any, mean: Any, boxes: Any, width: Any, record: Any,
+    hangs: bool, s: Any, t: Any, u0: Any, v0: Any, tile: Any, edge: Any, caps: Any, outlines: Any, later: Any,
+    view: Any, line: Any, slopes: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any,
+    shift: Any, rays: Any, at: Any, light: Any, mean: Any, boxes: Any, width: Any, record: Any,
 ) -> None:  # fmt: skip
     """Count, or write down, a row's pixels. u, v: column of lane 0, and row. boxes: how many there are."""
     pixels, of_caps, taps, clear, moved, unknown, texels, weights, cursor = record
@@ -261,5 +261,3 @@ def write_bytes(out: Any, width: Any, of_pixel: Any, v: Any, u: Any, some: Any, 
             k, at = three * j + channel, first + j * channels + channel
             value = rays[SHOWN + k] + (ONE - rays[HIDDEN + j]) * np.float32(out[at]) + HALF
             out[at] = np.uint8(np.int32(value if value < WHITE else WHITE))
-
-

@@ -49,8 +49,7 @@ def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
 
     @fused_part
     def shown(border, every, fine, words, starts, last, bands, rays, boxes, parts):
-        cap_patches.call_whole(every, fine, words, starts, last, border, bands, rays, boxes, parts)
-        cap_patches.show_whole(every, fine, words, starts, last, bands, rays, boxes, parts)
+        cap_patches.show_whole(every, fine, words, starts, last, border, bands, rays, boxes, parts)
 
     rng, size, count = np.random.default_rng(first), (317, 203), 13
     image = cv2.GaussianBlur(rng.integers(0, 256, (*size[::-1], 3)).astype(np.uint8), (0, 0), 4)

@@ -176,7 +176,7 @@ class OwnRays:
 
         self.table = CapTable.of(scene_of(CAMERA, PANE, math.inf), [drop], np.zeros(1, np.intp))
         self.tile, self.rays = np.zeros((5, 3, 3), np.float32), np.zeros(PLANES * 64, np.float32)
-        self.beams, self.places, *_ = room_for_light()
+        self.beams, self.noted, *_ = room_for_light()
         self.outline = self.table.outlines[0]
         self.middle = round(float(self.outline[0])), round(float(self.outline[1]))
         self.origin = fit(self.table.nodes, self.table.columns[0], *self.middle, 20, self.tile)
@@ -204,15 +204,15 @@ class OwnRays:
         from rainstereo.compiled.cap_light import HALVES, trace_light
         from rainstereo.compiled.cap_rays import PLANES, SUB, WEIGHT, Y_
 
-        places, lattice = self.places.reshape(4, -1), self.table.scene.lattice
-        places[0, :8], places[1, :8], places[2, :8] = u - self.origin[0], v - self.origin[1], hidden
+        noted, lattice = self.noted.reshape(5, -1), self.table.scene.lattice
+        noted[:4, :8] = np.array([u - self.origin[0], v - self.origin[1], hidden, 0.0])[:, None]
         trace_light(
-            self.table.columns[0], self.outline, self.tile, *self.origin, lattice.later, lattice.view, self.places, 0,
+            self.table.columns[0], self.outline, self.tile, *self.origin, lattice.later, lattice.view, self.noted, 0,
             self.beams,
         )  # fmt: skip
         planes = self.beams.reshape(HALVES, PLANES, 8, 8)[..., 0]
         x, y, weights = (planes[:, int(plane) // 64].reshape(-1) for plane in (SUB, SUB + Y_, WEIGHT))
-        return np.stack([x, y], -1), weights * places[3, 0]
+        return np.stack([x, y], -1), weights * noted[4, 0]
 
 
 @pytest.mark.parametrize("way", ["one by one", "by derivatives"])
