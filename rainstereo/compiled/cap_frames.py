@@ -115,9 +115,9 @@ def frame(
                     shares_of_row(tile, t, s, lanes, low, high, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
                         taken(tile, t, s, u1, v, lanes, wide, caps, number, rivals, outlines, line, rays)
-                    slopes_of_row(tile, t, slopes)
                     share_out(rays, begin, end)
                     if mode != DRAW:
+                        slopes_of_row(tile, t, slopes)
                         record_row(
                             mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, t, u0, v0,
                             tile, edge, caps, outlines, later, view, line, slopes, (scene.shape[1], scene.shape[0]),
@@ -140,10 +140,13 @@ def frame(
                             waiting, words, starts, last, shift, border, cap, outline, tile, u0, v0, later, view,
                             scene.shape[2], light, out,
                         )  # fmt: skip
-                    made = own_of_row(
-                        words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
-                        later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden, total, width, out,
-                    )  # fmt: skip
+                    if tiny or outline[OUT_RIVALS] > 0:
+                        slopes_of_row(tile, t, slopes)
+                        made = own_of_row(
+                            words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number,
+                            outlines, later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden,
+                            total, width, out,
+                        )  # fmt: skip
                     if every:
                         show_whole(every, fine, words, starts, last, border, bands, rays, places, parts)
                     while alone:

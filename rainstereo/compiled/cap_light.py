@@ -37,6 +37,7 @@ from .compile import fused, fused_part
 from .prefetch import to_read
 
 EIGHT = np.uint64(WIDE)
+SIZE_SHIFT, REST, NOTHING = np.uint32(SIZE_BITS), np.uint32((1 << SIZE_BITS) - 1), np.uint32(NO_BOX)
 PLACE, PLACE_DOWN, SHARE_HIDDEN, HANGS, UNIT = (NOTED * k for k in range(5))
 """Planes of what is noted: see `cap_beams.traced`."""
 
@@ -116,10 +117,15 @@ def one_light(
 
 
 @fused_part
+def smallest(box: Any) -> Any:
+    """A box from `boxes_of_rays`; the smallest there is where it would be the image itself."""
+    return box & REST if box >> SIZE_SHIFT == NOTHING else box
+
+
+@fused_part
 def box_of(box: Any, starts: Any) -> Any:
-    """The number among all of a box from `boxes_of_rays`; the smallest there is where it is the image itself."""
-    size, rest = np.uint64(box) >> np.uint64(SIZE_BITS), np.uint64(box) & np.uint64((1 << SIZE_BITS) - 1)
-    return np.uint64(starts[np.uint64(0) if size == np.uint64(NO_BOX) else size]) + rest
+    """Its number among all."""
+    return np.uint64(starts[np.uint64(box >> SIZE_SHIFT)]) + np.uint64(box & REST)
 
 
 @fused_part
@@ -132,10 +138,12 @@ def call_light(
         rays = beams[half * PLANES * 64 : (half + 1) * PLANES * 64]
         boxes_of_rays(outline, last, shift, border, len(starts), rays, 64, boxes)
         for j in range(np.uint64(64)):
+            weights[to + j] = rays[WEIGHT + j]
+            boxes[j] = smallest(boxes[j])
+        for j in range(np.uint64(64)):
             number = box_of(boxes[j], starts)
             to_read(words, number)
             at[to + j] = np.uint32(number)
-            weights[to + j] = rays[WEIGHT + j]
         to += np.uint64(64)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .cap_edges import LANES, NO_BOX, SIZE_BITS
-from .cap_light import box_of
+from .cap_light import box_of, smallest
 from .cap_looks import INSIDE, look_at, look_at_box, sides
 from .cap_rays import HIDDEN, ONE, SUB, WEIGHT, Y_, ZERO
 from .cap_tiles import ACROSS, DOWN, FAR, GAINS, KIND, SIZE
@@ -78,7 +78,7 @@ def record_light(
     """The taps of a pixel whose rays are as `cap_light` draws them; at: see `cap_edges.boxes_of_rays`."""
     for j in range(LANES):
         if rays[WEIGHT + j] > ZERO:
-            _tap(texels, weights, cursor, filling, np.int64(box_of(at[j], starts)), rays[WEIGHT + j])
+            _tap(texels, weights, cursor, filling, np.int64(box_of(smallest(at[j]), starts)), rays[WEIGHT + j])
 
 
 @fused
