@@ -321,16 +321,17 @@ def own_of_row(
                 )  # fmt: skip
                 made = 0
             continue
-        share = ZERO
+        share, alone = ZERO, False
         shown[:] = ZERO
-        for which in (number, rival):
+        for part in range(2):  # all rays are on their way before the first of them are summed
+            which, some, boxes = number if part == 0 else rival, rays[RAYS * part :], at[RAYS * part :]
             share += set_out(
-                at_s, u + lane, v, True, form, which, caps, number, rival, outlines, line, slopes, rays,
-                np.uint64(0),
+                at_s, u + lane, v, True, form, which, caps, number, rival, outlines, line, slopes, some, np.uint64(0),
             )  # fmt: skip
-            trace_own(caps[which], later, view, rays, LANES)
-            boxes_of_rays(outlines[which], last, shift, border, len(starts), rays, LANES, at)
-            alone = call_boxes(words, starts, LANES, at)
-            add_rays(words, scene, alone, rays, np.uint64(0), at, shown)
+            trace_own(caps[which], later, view, some, LANES)
+            boxes_of_rays(outlines[which], last, shift, border, len(starts), some, LANES, boxes)
+            alone |= call_boxes(words, starts, LANES, boxes)
+        for part in range(np.uint64(2)):
+            add_rays(words, scene, alone, rays, LANES * part, at, shown)
         mix(out, pixel, scene.shape[2], shown, max(share, before) if hangs and not tiny else min(share, ONE))
     return made

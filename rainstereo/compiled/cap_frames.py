@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .cap_beams import TOGETHER as TOGETHER_LIGHT
 from .cap_edges import (
     RAYS,
     TOGETHER,
@@ -21,10 +22,11 @@ from .cap_edges import (
     slopes_of_row,
     trace_own,
 )
+from .cap_light import draw_light, note_light, one_light, room_for_light
 from .cap_looks import is_whole, show_alone
-from .cap_patches import PLACES, call_whole, show_whole, whole_of_row
-from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit, of_row
-from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
+from .cap_patches import PLACES, show_whole, whole_of_row
+from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit
+from .cap_records import PIXELS, TAPS, add_places, record_light, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
 from .cap_tiles import (
     AXX,
@@ -34,6 +36,7 @@ from .cap_tiles import (
     CX,
     CY,
     FAR,
+    LITS,
     OUT_RADIUS,
     OUT_RIVALS,
     SIZE,
@@ -73,7 +76,7 @@ def frame(
     starts, pitches, inverses = boxes
     width, height = size
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
-    rays, line, tile, slopes, total, at, beams, pixels, hidden, places, parts = desk
+    rays, line, tile, slopes, total, at, beams, pixels, hidden, places, parts, light = desk
     for number in range(len(caps)):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
@@ -91,7 +94,7 @@ def frame(
                     1.45 * radius * wide + wide * wide
                 )  # of room: a pixel's corner is 0.71 pixels from its middle
                 hangs, tiny = hangs_over(tile, cap, wide, 1.5 * reach), radius < TINY * wide
-                s, known = np.float32(u1) - u0, False
+                s, known, waiting = np.float32(u1) - u0, False, 0
                 following = next_span(tile, np.float32(v1) - v0, s, lanes, cap, edge, line, rays)
                 for v in range(v1, v2):
                     low, high = following
@@ -112,14 +115,13 @@ def frame(
                     shares_of_row(tile, t, s, lanes, low, high, edge, wide, hangs, cap, line, rays)
                     if outline[OUT_RIVALS] > 0:
                         taken(tile, t, s, u1, v, lanes, wide, caps, number, rivals, outlines, line, rays)
-                    of_row(tile, t, line)
-                    slopes_of_row(tile, t, slopes)
                     share_out(rays, begin, end)
                     if mode != DRAW:
+                        slopes_of_row(tile, t, slopes)
                         record_row(
-                            mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, edge, caps,
-                            outlines, later, view, line, slopes, (scene.shape[1], scene.shape[0]), starts, pitches,
-                            inverses, border, shift, rays, at, total, len(words), width, record,
+                            mode == FILL, u1, v, number, lanes, low, high, begin, end, tiny, hangs, s, t, u0, v0,
+                            tile, edge, caps, outlines, later, view, line, slopes, (scene.shape[1], scene.shape[0]),
+                            starts, pitches, inverses, border, shift, rays, at, light, total, len(words), width, record,
                         )  # fmt: skip
                         continue
                     for j in range(np.uint64(3 * 64)):
@@ -129,18 +131,34 @@ def frame(
                         every = fine = NONE
                     alone = every & ~above(rays, SIZE, -HALF)
                     every, fine = every & ~alone, fine & ~alone
+                    if not tiny:
+                        waiting = note_light(
+                            s, t, v * width + u1, scene.shape[2], low, high, hangs, rays, light, waiting,
+                        )  # fmt: skip
+                    if waiting >= TOGETHER_LIGHT:
+                        waiting = draw_light(
+                            waiting, words, starts, last, shift, border, cap, outline, tile, u0, v0, later, view,
+                            scene.shape[2], light, out,
+                        )  # fmt: skip
+                    if tiny or outline[OUT_RIVALS] > 0:
+                        slopes_of_row(tile, t, slopes)
+                        made = own_of_row(
+                            words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number,
+                            outlines, later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden,
+                            total, width, out,
+                        )  # fmt: skip
                     if every:
-                        call_whole(every, fine, words, starts, last, border, bands, rays, places, parts)
-                    made = own_of_row(
-                        words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number, outlines,
-                        later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden, total, width, out,
-                    )  # fmt: skip
-                    if every:
-                        show_whole(every, fine, words, starts, last, bands, rays, places, parts)
+                        show_whole(every, fine, words, starts, last, border, bands, rays, places, parts)
                     while alone:
                         show_alone(scene, last, border, rays, lowest(alone), total)
                         alone &= alone - ONE_LANE
-                    write_bytes(out, width, scene.shape[2], v, u1, lanes, rays)
+                    some = (0, lanes) if hangs else (low // 8 * 8, high)  # nothing is hidden beyond
+                    write_bytes(out, width, scene.shape[2], v, u1, some, rays)
+                if waiting > 0:
+                    draw_light(
+                        waiting, words, starts, last, shift, border, cap, outline, tile, u0, v0, later, view,
+                        scene.shape[2], light, out,
+                    )  # fmt: skip
         if made > 0:
             draw_own(
                 words, scene, starts, last, shift, border, cap, outline, later, view, beams, at, pixels[:made],
@@ -151,9 +169,9 @@ def frame(
 @fused
 def record_row(
     filling: bool, u: Any, v: Any, number: Any, lanes: Any, low: Any, high: Any, begin: Any, end: Any, tiny: bool,
-    hangs: bool, s: Any, edge: Any, caps: Any, outlines: Any, later: Any, view: Any,
-    line: Any, slopes: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any, shift: Any,
-    rays: Any, at: Any, mean: Any, boxes: Any, width: Any, record: Any,
+    hangs: bool, s: Any, t: Any, u0: Any, v0: Any, tile: Any, edge: Any, caps: Any, outlines: Any, later: Any,
+    view: Any, line: Any, slopes: Any, size: Any, starts: Any, pitches: Any, inverses: Any, border: Any,
+    shift: Any, rays: Any, at: Any, light: Any, mean: Any, boxes: Any, width: Any, record: Any,
 ) -> None:  # fmt: skip
     """Count, or write down, a row's pixels. u, v: column of lane 0, and row. boxes: how many there are."""
     pixels, of_caps, taps, clear, moved, unknown, texels, weights, cursor = record
@@ -173,6 +191,14 @@ def record_row(
             mean[1] = rays[CY + j] - shift[1] + (rays[AYY + j] + rays[BYY + j]) * bend
             mean[2] = ONE
             off = not rays[FAR + j] >= ZERO
+        elif low <= lane < high and rays[LITS + j] == ONE and not rays[RIVAL + j] > ZERO and not tiny:
+            one_light(
+                s + np.float32(lane), t, rays[HIDDEN + j], hangs, caps[number], outlines[number], tile, u0, v0, later,
+                view, rays, light,
+            )  # fmt: skip
+            off = add_places(rays, shift, last, mean)
+            boxes_of_rays(outlines[number], last, shift, border, len(starts), rays, RAYS, at)
+            record_light(starts, rays, at, texels, weights, cursor, filling)
         elif low <= lane < high and has_own(rays, lane, tiny):
             rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
             near = bool(rival >= 0 or not rays[ROOM + j] > edge)
@@ -206,7 +232,7 @@ def desk() -> tuple[Any, ...]:
         np.zeros(PLANES * 64, np.float32), np.zeros(15, np.float32), np.zeros((5, 3, 3), np.float32),
         np.zeros(12, np.float32), np.zeros(4, np.float32), np.zeros(64, np.uint32), np.zeros(PLANES * 64, np.float32),
         np.zeros(TOGETHER, np.int64), np.zeros(TOGETHER, np.float32),
-        np.zeros(PLACES, np.uint32), np.zeros(PLACES, np.uint32),
+        np.zeros(PLACES, np.uint32), np.zeros(PLACES, np.uint32), room_for_light(),
     )  # fmt: skip
 
 
@@ -220,19 +246,20 @@ def call_for(out: Any, width: Any, channels: Any, v: Any, stop: Any, u: Any, lan
 
 
 @fused_part
-def write_bytes(out: Any, width: Any, of_pixel: Any, v: Any, u: Any, lanes: Any, rays: Any) -> None:
-    """Mix what a row shows with what is there, where a cap hides it."""
+def write_bytes(out: Any, width: Any, of_pixel: Any, v: Any, u: Any, some: Any, rays: Any) -> None:
+    """Mix what lanes of a row show, some[0] to before some[1], with what is there, where a cap hides it."""
     channels, three, block = np.uint64(of_pixel), np.uint64(3), np.uint64(32)
-    first, stop = np.uint64((v * width + u) * of_pixel), np.uint64((v + 1) * width * of_pixel)
+    start, stop = np.uint64(some[0]), np.uint64(some[1])
+    first, last = np.uint64((v * width + u) * of_pixel), np.uint64((v + 1) * width * of_pixel)
     if channels == three:
-        count = (three * np.uint64(lanes) + block - np.uint64(1)) // block * block  # whole vectors
-        for j in range(np.uint64(0), (count + three - np.uint64(1)) // three, EIGHT):  # beyond the lanes, all is clear
+        begin, count = three * start, (three * (stop - start) + block - np.uint64(1)) // block * block  # whole vectors
+        for j in range(start, start + (count + three - np.uint64(1)) // three, EIGHT):  # beyond the lanes, all is clear
             thrice(rays, HIDDEN + j, COVER + three * j)
-        for k in range(min(count, stop - first)):
+        for k in range(begin, min(begin + count, last - first)):
             value = rays[SHOWN + k] + (ONE - rays[COVER + k]) * np.float32(out[first + k]) + HALF
             out[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))
         return
-    for j in range(np.uint64(lanes)):
+    for j in range(start, stop):
         for channel in range(channels):
             k, at = three * j + channel, first + j * channels + channel
             value = rays[SHOWN + k] + (ONE - rays[HIDDEN + j]) * np.float32(out[at]) + HALF

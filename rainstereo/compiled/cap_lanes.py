@@ -123,6 +123,28 @@ def _arguments(rays: Any, count: int) -> Any:
     return types.void(rays, types.uint64, types.uint64, types.uint64, *[types.float32] * count)
 
 
+def of_light(inside: Lanes, spread: Lanes, per: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """Of light about rays, behind the cap: the mean of the component along the normal, the mean of its square, and the
+    largest square; per: 1 / spread. See `cap_rays.cross`."""
+    high, low = inside + spread, inside - spread
+    high, low = high.where(high.above(0.0)), low.where(low.above(0.0))
+    mean = (high * high.root() - low * low.root()) * (per * (1 / 3))
+    return mean, (high + low) * (high - low) * (per * 0.25), high
+
+
+def refracted(before: Lanes, mean: Lanes, square: Lanes, curvature: Lanes, q: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """By how much of its way from the sphere's middle a wave vector changes there; which part of the light passes; and
+    the component before the surface over that behind it, which is `square` / `mean`."""
+    less = before * mean
+    p, t = less + q * square, less + square
+    both = p * t
+    every = both * square
+    over = 1.0 / every.where(every.above(0.0), 1.0)  # one division for all
+    per = mean * square * over
+    passed = (less + less) * (p * p + q * t * t) * (per * per)
+    return (1.0 - q) * curvature * (p * per), passed, less * both * over
+
+
 def _through_cap(soft: bool) -> Callable[..., None]:
     """See `cap_rays.cross`."""
     spread_, sharp_, stretch_ = (64 * i for i in (53, 56, 52))
@@ -139,26 +161,14 @@ def _through_cap(soft: bool) -> Callable[..., None]:
         # the root of the quadratic, as the product of both roots over the other
         s = room.where(towards, root - b) / (b + root).where(towards, q)
         before = root * curvature  # component of the wave vector along the sphere's normal
-        less = 1.0 - q
-        inside = before * before + less
+        inside = before * before + (1.0 - q)
         if soft:
-            spread, per = at(spread_), at(sharp_)
-            high, low = inside + spread, inside - spread
-            high, low = high.where(high.above(0.0)), low.where(low.above(0.0))
-            mean = (high * high.root() - low * low.root()) * (per * (1 / 3))
-            turned = (high + low) * (high - low) * (per * 0.25)
-            product = mean * turned
-            over = 1.0 / product.where(product.above(0.0), 1.0)  # one division for two
-            put(stretch_, before * mean * mean * over)
-            turned = turned * (turned * over)
-            inside = high
+            mean, squared, inside = of_light(inside, at(spread_), at(sharp_))
         else:
-            turned = mean = inside.root()
-        p, t = before + q * turned, before + turned
-        both = 1.0 / (p * t)
-        bend = less * curvature * (p * both)
-        twice = before * mean
-        passed = (twice + twice) * (p * p + q * t * t) * (both * both)
+            squared, mean = inside, inside.root()
+        bend, passed, stretch = refracted(before, mean, squared, curvature, q)
+        if soft:
+            put(stretch_, stretch)
         rise = s * kz
         px, py = px + s * kx, py + s * ky
         up = kz + bend * (rise + depth)

@@ -68,7 +68,7 @@ def _placed(fine: bool, border: int) -> Any:
         builder.branch(loop)
         builder.position_at_end(loop)
         done, s, t = builder.phi(LONG), Lanes(builder, builder.phi(REALS)), Lanes(builder, builder.phi(REALS))
-        at = []
+        known, at = builder.phi(LONG), []
         for (c, a, b, aa, bb, ab), end in zip(axes, lasts, strict=True):
             place = (c + t * (b + t * (bb * 0.5))) + s * (a + s * (aa * 0.5) + t * ab)
             at.append(builder.fptosi((_folded(place, end, border) + middle).value, WORDS))
@@ -80,8 +80,8 @@ def _placed(fine: bool, border: int) -> Any:
         box = builder.add(builder.add(start, at[0]), builder.mul(at[1], pitch))
         box = builder.select(chosen, box, alike(WORDS, 0))
         store(builder, box, boxes, here)
-        for each in range(WIDE):
-            number = builder.load(builder.gep(boxes, [builder.add(here, LONG(each))]))
+        for each in range(WIDE):  # those of the look before: to read them is quicker than to take a vector apart
+            number = builder.load(builder.gep(boxes, [builder.add(known, LONG(each))]))
             call(builder, words, builder.zext(number, LONG))
             if fine:
                 below = builder.add(number, builder.extract_element(pitch, FOUR(each)))
@@ -93,6 +93,7 @@ def _placed(fine: bool, border: int) -> Any:
         builder.cbranch(builder.icmp_unsigned("<", count, looks), loop, after)
         for phi, begun, coming in (
             (done, LONG(0), count), (s.value, left.value, next_s.value), (t.value, top.value, next_t.value),
+            (known, first, here),
         ):  # fmt: skip
             phi.add_incoming(begun, before)
             phi.add_incoming(coming, loop)
@@ -174,16 +175,19 @@ def _turned(middle: Lanes, last: Lanes) -> Lanes:
     """Middles of patches between -last and last: beyond its edges a mirrored scene repeats itself every 2 last."""
     turn = last + last
     turns = (middle / turn.where(turn.above(1e-3), 1.0) + 0.5).floor()
-    return middle - turns * turn
+    middle = middle - turns * turn
+    return middle.where((last - middle.size()).above(-1.0))  # what is too far to be told: anywhere
 
 
 def _folded(at: Lanes, last: Lanes, border: int) -> Lanes:
     """Coordinates brought between 0 and `last`, as `cap_looks.folded` does, no farther than that from a middle that is
-    `_turned`."""
+    `_turned`; those between as they are."""
     if border == INSIDE:
         return at
     if border == MIRROR:
-        at = last - (last - at.size()).size()
+        at = at.size()
+        over = at - last
+        return at - over.where(over.above(0.0)) * 2.0
     at = at.where(at.above(0.0), 0.0)
     return last.where(at.above(last), at)
 
@@ -271,11 +275,11 @@ def whole_of_row(low: Any, high: Any, rays: Any) -> Any:
 
 
 @fused_part
-def call_whole(
+def show_whole(
     every: Any, fine: Any, words: Any, starts: Any, last: Any, border: Any, bands: Any, rays: Any, boxes: Any,
     parts: Any,
 ) -> None:  # fmt: skip
-    """Find the boxes that those pixels look at, and call for them. boxes, parts: (`PLACES`,) uint32."""
+    """Write what those pixels show to `SHOWN`. boxes, parts: (`PLACES`,) uint32."""
     lane, first = lowest(every), np.uint64(0)
     left, beyond = every >> lane, (every & ~above(rays, FAR, np.float32(-1e-30))) >> lane
     while left:
@@ -289,7 +293,7 @@ def call_whole(
                 _mirrored(words, rays, lane, coarse, looks, starts, last[0], last[1], boxes, parts, first)
             else:
                 _at_edge(words, rays, lane, coarse, looks, starts, last[0], last[1], boxes, parts, first)
-            first += ROOM
+            _sum(words, rays, lane, coarse, looks, last[0], starts, boxes, parts, first)
         if exact & LANES:
             looks = np.uint64(bands[0, AIMS])
             if not out:
@@ -298,26 +302,7 @@ def call_whole(
                 _fine_mirrored(words, rays, lane, exact, looks, starts, last[0], last[1], boxes, parts, first)
             else:
                 _fine_at_edge(words, rays, lane, exact, looks, starts, last[0], last[1], boxes, parts, first)
-            first += ROOM
+            _fine_sum(words, rays, lane, exact, looks, last[0], starts, boxes, parts, first)
         lane += EIGHT
         left >>= EIGHT
         beyond >>= EIGHT
-
-
-@fused_part
-def show_whole(
-    every: Any, fine: Any, words: Any, starts: Any, last: Any, bands: Any, rays: Any, boxes: Any, parts: Any
-) -> None:  # fmt: skip
-    """Write what those pixels show to `SHOWN`."""
-    lane, first = lowest(every), np.uint64(0)
-    left = every >> lane
-    while left:
-        coarse, exact = left & ~(fine >> lane), left & (fine >> lane)
-        if coarse & LANES:
-            _sum(words, rays, lane, coarse, np.uint64(bands[1, AIMS]), last[0], starts, boxes, parts, first)
-            first += ROOM
-        if exact & LANES:
-            _fine_sum(words, rays, lane, exact, np.uint64(bands[0, AIMS]), last[0], starts, boxes, parts, first)
-            first += ROOM
-        lane += EIGHT
-        left >>= EIGHT

@@ -133,6 +133,12 @@ def cross(cap: Any, later: Any, view: Any, rays: Any, low: Any, high: Any, to: A
         through_soft(rays, first, last, to, square, depth, curvature, q)
     else:
         through_hard(rays, first, last, to, square, depth, curvature, q)
+    onward(cap, later, view, rays, first, last, to)
+
+
+@fused_part
+def onward(cap: Any, later: Any, view: Any, rays: Any, first: Any, last: Any, to: Any) -> None:
+    """Rays behind a cap's surface, through the rest of the chamber and to the scene; see `cross`."""
     for face in range(len(later)):
         thick, q1, q2 = later[face, 0], later[face, 1] * later[face, 1], later[face, 2] * later[face, 2]
         for j in range(first, last):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from .cap_edges import LANES, NO_BOX, SIZE_BITS
+from .cap_light import box_of, smallest
 from .cap_looks import INSIDE, look_at, look_at_box, sides
 from .cap_rays import HIDDEN, ONE, SUB, WEIGHT, Y_, ZERO
 from .cap_tiles import ACROSS, DOWN, FAR, GAINS, KIND, SIZE
@@ -68,6 +69,16 @@ def record_whole(
             else:
                 box, _, _ = look_at_box(False, start, pitch, inverse, last, on, rays, j, a, b)
                 _tap(texels, weights, cursor, filling, box, part)
+
+
+@fused
+def record_light(
+    starts: Any, rays: Any, at: Any, texels: Any, weights: Any, cursor: Any, filling: bool
+) -> None:  # fmt: skip
+    """The taps of a pixel whose rays are as `cap_light` draws them; at: see `cap_edges.boxes_of_rays`."""
+    for j in range(LANES):
+        if rays[WEIGHT + j] > ZERO:
+            _tap(texels, weights, cursor, filling, np.int64(box_of(smallest(at[j]), starts)), rays[WEIGHT + j])
 
 
 @fused

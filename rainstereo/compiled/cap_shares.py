@@ -35,7 +35,7 @@ from .cap_rays import (
 )
 from .cap_tiles import OUT_RADIUS, OUT_RIVAL, OUT_RIVALS, OUT_X, OUT_Y, along, down, value_on
 from .cap_vectors import above, above_zero, ends, lanes_from, lowest
-from .compile import compiled, fused, fused_part
+from .compile import fused, fused_part
 
 SAGITTA = np.float32(1.1 / 24)
 """How far an arc is from its tangent in the mean, over the square of its length and its curvature: 1/24; arcs across a
@@ -216,29 +216,6 @@ def taken(
             rays[HIDDEN + j] *= ZERO if more > ZERO else ONE
             near = ONE if more > -part else ZERO
             rays[RIVAL + j] += near * (name - rays[RIVAL + j])
-
-
-@compiled
-def count_rivals(x: Any, y: Any, radius: Any, counts: Any) -> None:
-    """How many other circles, (N,) each, meet each; none meets one without a radius."""
-    for i in range(len(x)):
-        found = 0
-        for j in range(len(x)):
-            dx, dy, reach = x[i] - x[j], y[i] - y[j], radius[i] + radius[j]
-            found += (dx * dx + dy * dy < reach * reach) & (radius[j] > 0)
-        counts[i] = found - 1 if radius[i] > 0 else 0
-
-
-@compiled
-def list_rivals(x: Any, y: Any, radius: Any, rivals: Any) -> None:
-    """Their numbers, in the order of the circles that they meet, and of their own."""
-    at = 0
-    for i in range(len(x)):
-        for j in range(len(x)):
-            dx, dy, reach = x[i] - x[j], y[i] - y[j], radius[i] + radius[j]
-            if dx * dx + dy * dy < reach * reach and radius[i] > 0 and radius[j] > 0 and i != j:
-                rivals[at] = j
-                at += 1
 
 
 @fused_part

@@ -116,18 +116,6 @@ def lit_span(line: Any, s: Any, low: Any, high: Any, cap: Any, rays: Any) -> Any
 
 
 @fused_part
-def trace_lanes(
-    tile: Any, t: Any, s: Any, low: Any, high: Any, cap: Any, later: Any, view: Any, line: Any,
-    rays: Any, to: Any,
-) -> None:  # fmt: skip
-    """Rays of a row, t and s pixels from the tile's own, to planes from `to` on; lanes from `low`, whole vectors."""
-    of_row(tile, t, line)
-    end = low + (high - low + 7) // 8 * 8
-    take_up(line, s, low, end, rays)
-    cross(cap, later, view, rays, low, end, to, False)
-
-
-@fused_part
 def row_of_tile(
     tile: Any, t: Any, s: Any, is_first: bool, span: Any, following: Any, cap: Any,
     later: Any, view: Any, line: Any, rays: Any,
@@ -162,10 +150,15 @@ def row_of_tile(
                 rays[to + GAIN + j] = ZERO
             of_row(tile, down, line)
             take_up(line, across, begin, begin + (end - begin + 7) // 8 * 8, rays)
+            start = begin
             begin, end = lit_span(line, across, begin, end, cap, rays)
             if begin == end:
                 continue
-        trace_lanes(tile, down, across, begin, end, cap, later, view, line, rays, to)
+            begin = start + (begin - start) // 8 * 8  # whole vectors of those that have been taken up
+        else:
+            of_row(tile, down, line)
+            take_up(line, across, begin, begin + (end - begin + 7) // 8 * 8, rays)
+        cross(cap, later, view, rays, begin, begin + (end - begin + 7) // 8 * 8, to, False)
     return low, high
 
 

@@ -25,7 +25,7 @@ def _words(value: int) -> Any:
     return alike(WORDS, value)
 
 
-def _gathered(builder: Any, words: Any, numbers: Any, first: Any) -> Any:
+def gathered(builder: Any, words: Any, numbers: Any, first: Any) -> Any:
     """Eight words, at the places that `numbers` holds from `first` on."""
     found = ir.Constant(WORDS, ir.Undefined)
     for lane in range(WIDE):
@@ -129,7 +129,7 @@ def _weighed(_context: Any, words: Any, at: Any, _first: Any, rays: Any, _weight
         texels, numbers, first, data, weights = arguments(context, builder, signature, given)
         sums: list[Any] = []
         for half in (0, WIDE):
-            found = _gathered(builder, texels, numbers, builder.add(first, LONG(half)))
+            found = gathered(builder, texels, numbers, builder.add(first, LONG(half)))
             weight = load(builder, data, builder.add(weights, LONG(half)), REALS)
             parts = [builder.and_(builder.lshr(found, _words(BITS * channel)), _words(FIELD)) for channel in range(3)]
             new = [builder.fmul(builder.sitofp(part, REALS), weight) for part in parts] + [weight]

@@ -7,7 +7,7 @@ place is never far from the middle of one: then a look is one number read, not f
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -59,19 +59,18 @@ class Boxes:
         steps = [round(1 / float(inverse)) for inverse in self.inverse]
         return [(k, 2 ** (k // 2) // steps[k - 2], steps[k] // steps[k - 2]) for k in range(2, len(steps), 2)]
 
-    def words(self, image: Image) -> Any:
-        """All boxes of bytes, (H, W, 1 or 3), as (count,) uint32."""
-        from rainstereo.compiled import boxes as loops
-        from rainstereo.compiled.quads import halve
+    def words(self, image: Image, copy: Image | None = None) -> Any:
+        """All boxes of bytes, (H, W, 1 or 3), as (count,) uint32; copy: contiguous, gets a copy of the image."""
+        from rainstereo.compiled.boxes import every_box
 
-        cells: Any = np.empty([-(-n // 2) for n in image.shape[:2]], dtype=np.uint32)
-        halve(image, True, cells.ravel())
-        loops.widen(cells.ravel())
         found = np.empty(self.count, dtype=np.uint32)
-        loops.first_boxes(cells, self.part(found, 0))
-        for k, apart, step in self.octaves:
-            loops.next_boxes(self.part(found, k - 2), apart, step, self.part(found, k - 1), self.part(found, k))
+        out = np.empty(0, dtype=np.uint8) if copy is None else copy.reshape(-1)
+        every_box(image, out, found, self.start, self.width, self._steps)
         return found
+
+    @cached_property
+    def _steps(self) -> Any:
+        return np.array(self.octaves, dtype=np.int64).reshape(-1, 3)
 
     def numbers(self, image: Image) -> Array:
         """All boxes of any image, (H, W, C), as (count, C) float32."""

@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
 from typing import Any, cast
 
 import numpy as np
@@ -30,7 +29,7 @@ from rainstereo.types import Array, Image, Indices, Mask
 from .boxes import Boxes
 from .contacts import touching
 from .drops import Drops
-from .outlines import Outlines
+from .outlines import BETWEEN, MARGIN, RING
 
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
@@ -42,7 +41,7 @@ each."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
 WIDER = 1.4, 1.25
 """Area of a box over that of its part of what a pixel shows: a little overlap is best."""
-FEW = 400  # caps, up to which all pairs are compared
+FEW = 1500  # caps, up to which all pairs are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ class FaceLattice:
         points, waves = (part @ frame.R_panel_cam.T for part in (rays.origins, rays.directions))
         nodes = np.stack([points[..., 0], points[..., 1], waves[..., 0], waves[..., 1]])
         later, end = _behind(chamber, panel)
-        view = _view(camera, frame, end, depth)
+        view: Image = _view(camera, frame, end, depth).astype(np.float32)
         return cls(nodes, later, view, frame.origin(chamber, panel), float(chamber.panels[panel].index))
 
     @property
@@ -116,6 +115,13 @@ class CapScene:
     def frame(self) -> PanelFrame:
         """The chamber's."""
         return PanelFrame.of(self.chamber)
+
+    @cached_property
+    def place(self) -> tuple[Array, Array, Array]:
+        """Where the face is, what is before it, and how the camera sees it: see `compiled.cap_outlines`."""
+        foot = self.frame.base(self.chamber, (0.0, 0.0), self.panel, "far")
+        layers = [(panel.thickness, panel.index) for panel in self.chamber.panels[: self.panel + 1]]
+        return foot, np.array(layers, dtype=np.float64), _view(self.camera, self.frame, 0.0, math.inf)
 
     def nodes(self, indices: tuple[float, ...]) -> Array:
         """The lattice, and how drops of each index dim."""
@@ -174,43 +180,49 @@ class CapTable:
     circles: Array = field(repr=False)
 
     @classmethod
-    def of(cls, scene: CapScene, caps: Sequence[SphericalCap], outlines: Outlines, groups: Indices) -> CapTable:
-        """A table of caps on the scene's face; groups: (N,) numbers kept with them."""
-        rows = [(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps]
-        return cls.of_columns(scene, np.array(rows, dtype=np.float64).reshape(-1, 5), outlines, groups)
-
-    @classmethod
-    def of_columns(cls, scene: CapScene, caps: Array, outlines: Outlines, groups: Indices) -> CapTable:
-        """The same, of the first five columns of `caps`."""
-        table = np.concatenate([caps, groups[:, None]], axis=1)
-        circles = np.stack([outlines.x, outlines.y, np.minimum(outlines.radius, FAR)], -1)
-        return cls._ordered(scene, table, circles)
+    def of(cls, scene: CapScene, caps: Sequence[SphericalCap], numbers: Indices) -> CapTable:
+        """Those that the image shows of caps on the scene's face; numbers: (N,) kept with them."""
+        rows = np.array([(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps], dtype=np.float64)
+        columns = np.ascontiguousarray(rows.T)
+        columns.setflags(write=False)
+        x, y, radius, angle, index = columns
+        table = cls._shown(scene, x, y, radius, angle, index, caps)
+        table.caps[:, 5] = numbers[table.caps[:, 5].astype(np.intp)]
+        return table
 
     @classmethod
     def of_table(cls, scene: CapScene, drops: Drops) -> CapTable:
-        """Those that the image shows of drops on the scene's face, numbered as they come."""
-        check_places(scene, cast(Sequence[SphericalCap], drops.lazily()), (drops.x, drops.y, drops.top))
-        outlines = Outlines.of_table(drops, scene.camera, scene.chamber, scene.frame)
-        index = np.full(len(drops), drops.index)
-        caps = np.stack([drops.x, drops.y, drops.radius, drops.contact_angle, index], -1)
-        shown = np.flatnonzero(outlines.radius > 0)
-        return cls.of_columns(scene, caps[shown], outlines.take(shown), shown)
+        """The same of drops in a table, numbered as they come."""
+        index = np.array([drops.index])
+        index.setflags(write=False)
+        caps = cast(Sequence[SphericalCap], drops.lazily())
+        return cls._shown(scene, drops.x, drops.y, drops.radius, drops.contact_angle, index, caps)
 
     @classmethod
-    def _ordered(cls, scene: CapScene, caps: Array, circles: Array) -> CapTable:
-        """With the caps in an order of their own, so that sums do not depend on the one in which they come."""
-        order = np.lexsort(caps[:, :5].T)
-        return cls(scene, caps[order], circles[order])
+    def _shown(
+        cls, scene: CapScene, x: Array, y: Array, radius: Array, angle: Array, index: Array,
+        caps: Sequence[SphericalCap],
+    ) -> CapTable:  # fmt: skip
+        from rainstereo.compiled.cap_outlines import outline
+
+        _check_places(scene, caps, x, y, radius, angle)
+        limits = MARGIN, FAR
+        return cls(
+            scene, *outline(x, y, radius, angle, index, *scene.place, RING, BETWEEN, limits, scene.camera.size)
+        )  # fmt: skip
 
     @classmethod
     def joined(cls, parts: list[CapTable]) -> list[CapTable]:
         """The same in one table for each face."""
+        from rainstereo.compiled.cap_outlines import ordered
+
         found: dict[CapScene, list[CapTable]] = {}
         for part in parts:
             found.setdefault(part.scene, []).append(part)
         return [
-            cls._ordered(
-                scene, np.concatenate([part.caps for part in some]), np.concatenate([part.circles for part in some])
+            cls(
+                scene,
+                *ordered(*(np.concatenate([getattr(part, name) for part in some]) for name in ("caps", "circles"))),
             )
             for scene, some in found.items()
         ]
@@ -222,37 +234,20 @@ class CapTable:
 
     # -- for the loops -------------------------------------------------------------------------------------------------
 
-    @cached_property
+    @property
     def columns(self) -> Array:
         """(N, 7), see `compiled.cap_rays`."""
-        x, y, radius, angle, index, _ = self.caps.T
-        origin = self.scene.lattice.origin
-        place = np.searchsorted(self._indices, index)
-        return np.ascontiguousarray(
-            np.stack(
-                [
-                    origin[0] + x, origin[1] + y, radius * radius, radius / np.tan(angle), np.sin(angle) / radius,
-                    index, place,
-                ],
-                -1,
-            )
-        )  # fmt: skip
+        return self._made[0]
 
-    @cached_property
-    def nodes(self) -> Array:
-        """The lattice, and how drops of each index dim."""
-        return self.scene.nodes(tuple(self._indices.tolist()))
-
-    @cached_property
-    def _indices(self) -> Any:
-        return np.unique(self.caps[:, 4])
-
-    @cached_property
+    @property
     def outlines(self) -> Array:
         """(N, 5), see `compiled.cap_tiles`: circles, and the part of `rivals` that is each cap's."""
-        first, _ = self._rivals
-        count = np.diff(first)
-        return np.concatenate([self.circles, np.stack([first[:-1], count], -1)], axis=1)
+        return self._made[1]
+
+    @property
+    def nodes(self) -> Array:
+        """The lattice, and how drops of each index dim."""
+        return self.scene.nodes(tuple(self._made[2].tolist()))
 
     @property
     def rivals(self) -> Indices:
@@ -260,23 +255,25 @@ class CapTable:
         return self._rivals[1]
 
     @cached_property
-    def _rivals(self) -> tuple[Indices, Indices]:
-        x, y, radius = np.ascontiguousarray(self.circles.T)
-        count = len(self.caps)
-        if count <= FEW:
-            from rainstereo.compiled import cap_shares as loops
+    def _made(self) -> tuple[Array, Array, Array]:
+        from rainstereo.compiled.cap_outlines import tabulated
 
-            counts = np.empty(count, dtype=np.int64)
-            loops.count_rivals(x, y, radius, counts)
-            first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-            rivals = np.empty(first[-1], dtype=np.int64)
-            loops.list_rivals(x, y, radius, rivals)
-            return first, rivals
-        shown = np.flatnonzero(radius > 0)
-        one, other = touching(x[shown], y[shown], radius[shown])
-        one, other = shown[np.concatenate([one, other])], shown[np.concatenate([other, one])]
-        first = np.concatenate([[0], np.cumsum(np.bincount(one, minlength=count))]).astype(np.int64)
-        return first, other[np.argsort(one, kind="stable")].astype(np.int64)
+        made: tuple[Array, Array, Array] = tabulated(
+            self.caps, self.circles, self._rivals[0], self.scene.lattice.origin
+        )
+        return made
+
+    @cached_property
+    def _rivals(self) -> tuple[Indices, Indices]:
+        """How many they are, (N,), and their numbers, cap by cap."""
+        from rainstereo.compiled.cap_outlines import meeting
+
+        if len(self.caps) <= FEW:
+            found: tuple[Indices, Indices] = meeting(self.circles)
+            return found
+        one, other = touching(*np.ascontiguousarray(self.circles.T))
+        one, other = np.concatenate([one, other]), np.concatenate([other, one])
+        return np.bincount(one, minlength=len(self.caps)), other[np.lexsort((other, one))]
 
     # -- drawn ---------------------------------------------------------------------------------------------------------
 
@@ -346,20 +343,21 @@ class _Tabulated:
     weights: Array
 
 
-def check_places(scene: CapScene, caps: Sequence[SphericalCap], columns: tuple[Array, Array, Array]) -> None:
+def _check_places(
+    scene: CapScene, caps: Sequence[SphericalCap], x: Array, y: Array, radius: Array, angle: Array
+) -> None:
     """ValueError unless the chamber has room for caps on a far face, and the scene lies beyond them.
 
-    columns: x and y of the caps' centres and their tops; caps themselves are looked at only where something is wrong.
+    The caps themselves are looked at only where something is wrong.
     """
-    chamber, panel, (x, y, top) = scene.chamber, scene.panel, columns
-    space = panel_plane.room(chamber, panel, "far")
-    if top.max() >= space:
+    space = panel_plane.room(scene.chamber, scene.panel, "far")
+    if math.isfinite(space) and not (radius * np.tan(angle / 2)).max() < space:
         for cap in caps:
             cap.check_room(space)
-    corners = product((x.min(), x.max()), (y.min(), y.max()))
-    bases = [scene.frame.base(chamber, (float(a), float(b)), panel, "far") for a, b in corners]
-    if not scene.depth > scene.frame.to_camera(np.array(bases))[:, 2].max():
-        DropStack(chamber, caps).check_depth(scene.depth)
+    if math.isfinite(scene.depth):
+        foot, along = scene.place[0], scene.frame.R_panel_cam[:, 2]
+        if not scene.depth > foot @ along + (x * along[0] + y * along[1]).max():
+            DropStack(scene.chamber, caps).check_depth(scene.depth)
 
 
 def _record(pixels: int, taps: int) -> tuple[Any, ...]:
@@ -397,7 +395,7 @@ def _view(camera: Camera, frame: PanelFrame, end: float, depth: float) -> Array:
         fold = 0.999 * min(float(fold_radius(camera.distortion)), 1e6)
         view[-1] = fold * fold
         view += [fx, fy, *camera.distortion.tolist(), *[0.0] * (12 - len(camera.distortion))]
-    return np.array(view, dtype=np.float32)
+    return np.array(view, dtype=np.float64)
 
 
-__all__ = ["CapScene", "CapTable", "check_places"]
+__all__ = ["CapScene", "CapTable"]

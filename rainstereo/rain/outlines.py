@@ -17,7 +17,6 @@ from rainstereo.refraction import project
 from rainstereo.types import Array, Indices, Mask
 
 from .contacts import clusters, touching
-from .drops import Drops
 
 SEEN, AROUND, HEIGHTS = 5, 16, 2
 """Points of a circle whose image is found, and those, of a polygon around it, that are interpolated between them: along
@@ -51,18 +50,6 @@ class Outlines:
         return cls.joined([cls(nowhere, nowhere, nowhere, camera.size), *parts])
 
     @classmethod
-    def of_table(cls, drops: Drops, camera: Camera, chamber: Chamber, frame: PanelFrame) -> Outlines:
-        """The same of drops in a table, without shapes; frame: the chamber's."""
-        x, y, radius, angle = drops.x, drops.y, drops.radius, drops.contact_angle
-        bases = np.stack([x, y, np.zeros(len(x))], -1) + frame.base(chamber, (0.0, 0.0), drops.panel, drops.face)
-        reach = np.where(angle > math.pi / 2, radius / np.sin(angle), radius)
-        top = drops.top if drops.face == "far" else -drops.top
-        blocks = (slice(first, first + BLOCK) for first in range(0, len(x), BLOCK))
-        parts = [cls._around(bases[some], reach[some], top[some], frame, camera, chamber)._shown() for some in blocks]
-        nowhere = np.zeros(0)
-        return cls.joined([cls(nowhere, nowhere, nowhere, camera.size), *parts])
-
-    @classmethod
     def whole(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber) -> Outlines:
         """The circles of drops, also beyond the image, wide enough for all rays that may be taken for a drop's.
 
@@ -92,13 +79,11 @@ class Outlines:
         aside: float = 0.0,
     ) -> Outlines:  # fmt: skip
         """Of drops at points of the faces, (N, 3) in the panel frame; top: (N,) along its z axis."""
-        phi = 2 * math.pi / SEEN * np.arange(SEEN)
-        ring = np.stack([np.cos(phi), np.sin(phi)], -1)
         points = np.broadcast_to(bases[:, None, None], (len(bases), HEIGHTS, SEEN, 3)).copy()
-        points[..., :2] += reach[:, None, None, None] * ring
+        points[..., :2] += reach[:, None, None, None] * RING
         points[..., 2] += (top[:, None] * np.linspace(0, 1, HEIGHTS))[..., None]
         pixels = project(frame.to_camera(points.reshape(-1, 3)), camera, chamber)[0]
-        rings = np.ascontiguousarray(pixels.T).reshape(2, -1, SEEN) @ _BETWEEN
+        rings = np.ascontiguousarray(pixels.T).reshape(2, -1, SEEN) @ BETWEEN
         u, v = rings.reshape(2, len(bases), -1)
         middle = np.stack([0.5 * (u.min(1) + u.max(1)), 0.5 * (v.min(1) + v.max(1))], -1)
         radius = np.sqrt((np.square(u - middle[:, :1]) + np.square(v - middle[:, 1:])).max(1)) + MARGIN
@@ -228,7 +213,13 @@ def _between() -> Array:
     return found
 
 
-_BETWEEN = _between()
+def _ring() -> Array:
+    """(SEEN, 2): points of a circle."""
+    phi = 2 * math.pi / SEEN * np.arange(SEEN)
+    return np.stack([np.cos(phi), np.sin(phi)], -1)
+
+
+RING, BETWEEN = _ring(), _between()
 
 
 def _bases(drops: Sequence[Drop], frame: PanelFrame, chamber: Chamber) -> Array:

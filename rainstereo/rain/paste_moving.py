@@ -23,6 +23,16 @@ class PasteMoving:
         self.caps = [table for table in tables if isinstance(table, CapTable) and len(table.caps)]
         self.soft = self.looks.soft
 
+    def drawn(self, image: Image) -> Image | None:
+        """A copy of an image, without a surround, with the drops: copied while boxes are made of it. None if there is
+        more to do."""
+        scene = np.ascontiguousarray(image).reshape(*image.shape[:2], -1)
+        if self.looks.tables or not self.caps or not _has_words(scene):
+            return None
+        out = np.empty_like(scene)
+        self._draw(scene, out, out)
+        return out.reshape(image.shape)
+
     def paste(self, scene: Image, below: Image, out: Image) -> None:
         """Write the pixels of a frame; see `paste.Paste.paste`. `out` holds the clear image."""
         if self.looks.tables:
@@ -30,13 +40,20 @@ class PasteMoving:
         if not self.caps:
             return
         image, frame = scene.reshape(*scene.shape[:2], -1), out.reshape(*out.shape[:2], -1)
-        if out.dtype == np.uint8 and image.shape[2] in OF_WORDS:
-            words = self.caps[0].scene.boxes.words(image)
-            for table in self.caps:
-                table.draw(image, frame, words)
+        if _has_words(image):
+            self._draw(image, frame, None)
             return
         for table in self.caps:
             shown = table.values(image, frame)
             if out.dtype.kind == "u":
                 np.clip(np.rint(shown, out=shown), 0, np.iinfo(out.dtype).max, out=shown)
             frame.reshape(-1, image.shape[2])[table.pixels] = shown
+
+    def _draw(self, image: Image, frame: Image, copy: Image | None) -> None:
+        words = self.caps[0].scene.boxes.words(image, copy)
+        for table in self.caps:
+            table.draw(image, frame, words)
+
+
+def _has_words(image: Image) -> bool:
+    return image.dtype == np.uint8 and image.shape[2] in OF_WORDS

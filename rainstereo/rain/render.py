@@ -34,7 +34,7 @@ from .free_memory import give_back
 from .looks import Looks
 from .lookups import Lookups
 from .minified import Batch, Minifier
-from .moving_caps import CapScene, CapTable, check_places
+from .moving_caps import CapScene, CapTable
 from .outlines import Outlines
 from .paste import Paste
 from .paste_moving import PasteMoving
@@ -194,28 +194,22 @@ class Renderer:
         caps = [drop for drop in drops if isinstance(drop, SphericalCap)]
         if {(cap.panel, cap.face) for cap in caps} != {(caps[0].panel, "far")}:
             return None
-        table = self._cap_table(caps, Outlines.of(caps, self.camera, self.chamber), np.arange(len(caps)))
+        table = self._cap_table(caps, np.arange(len(caps)))
         return table if table is None else (table,) * (len(table.caps) > 0)
 
-    def _cap_table(self, caps: Sequence[SphericalCap], outlines: Outlines, numbers: Indices) -> CapTable | None:
+    def _cap_table(self, caps: Sequence[SphericalCap], numbers: Indices) -> CapTable | None:
         """Those caps on one panel's far face that the image shows; None if compiled loops cannot draw them."""
         scene = self._cap_scene(caps[0].panel)
-        if scene is None or min(cap.index for cap in caps) < 1:
-            return None
-        centres = np.array([cap.centre for cap in caps])
-        check_places(scene, caps, (centres[:, 0], centres[:, 1], np.array([cap.top for cap in caps])))
-        shown = np.flatnonzero(outlines.radius > 0)
-        return CapTable.of(scene, [caps[i] for i in shown], outlines.take(shown), numbers[shown])
+        return None if scene is None or min(cap.index for cap in caps) < 1 else CapTable.of(scene, caps, numbers)
 
     def _of_caps(self, groups: Sequence[Group], numbers: Indices) -> list[Any]:
         """Tables of caps on one panel's far face."""
         caps = [drop for group in groups for drop in group.drops if isinstance(drop, SphericalCap)]
-        outlines = Outlines.joined([group.outlines for group in groups])
         of_cap = np.repeat(numbers, [len(group.drops) for group in groups])
-        table = self._cap_table(caps, outlines, of_cap)
+        table = self._cap_table(caps, of_cap)
         if table is not None:
             return [table]
-        pixels, which = outlines.pixels()
+        pixels, which = Outlines.joined([group.outlines for group in groups]).pixels()
         return self._single_ray.tables_of_caps(caps, pixels, which, of_cap[which])
 
     def _cap_scene(self, panel: int) -> CapScene | None:
@@ -327,7 +321,11 @@ class Plan:
 
     def apply(self, image: Image) -> Image:
         """A copy of the clear image's frame with drops: (H, W[, 1 to 4]) uint8, uint16 or float32; never changed."""
-        out = self.renderer.framed(image).copy("C")
+        frame = self.renderer.framed(image)
+        sharp = self.tables and not self.layers and not self.renderer.linear_light and frame.shape == image.shape
+        if sharp and isinstance(self._paste_all, PasteMoving) and (drawn := self._paste_all.drawn(image)) is not None:
+            return drawn
+        out = frame.copy("C")
         if not self.tables and not self.layers:
             return out
         if self.renderer.linear_light:

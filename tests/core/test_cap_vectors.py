@@ -30,7 +30,7 @@ def test_weighted_sums_are_those_of_channels():
     rng = np.random.default_rng(0)
     bytes_ = rng.integers(0, 256, (500, 3)).astype(np.uint32)
     bytes_[:100] = 255  # the largest sums there can be
-    words = bytes_[:, 0] | bytes_[:, 1] << np.uint32(10) | bytes_[:, 2] << np.uint32(20)
+    words = bytes_[:, 0] | bytes_[:, 1] << np.uint32(8) | bytes_[:, 2] << np.uint32(16)
     at = rng.integers(0, 500, 72).astype(np.uint32)
     rays = rng.uniform(0, 1, 128).astype(np.float32)
     found = of_weights(words, at, np.uint64(3), rays, np.uint64(40))
@@ -49,8 +49,7 @@ def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
 
     @fused_part
     def shown(border, every, fine, words, starts, last, bands, rays, boxes, parts):
-        cap_patches.call_whole(every, fine, words, starts, last, border, bands, rays, boxes, parts)
-        cap_patches.show_whole(every, fine, words, starts, last, bands, rays, boxes, parts)
+        cap_patches.show_whole(every, fine, words, starts, last, border, bands, rays, boxes, parts)
 
     rng, size, count = np.random.default_rng(first), (317, 203), 13
     image = cv2.GaussianBlur(rng.integers(0, 256, (*size[::-1], 3)).astype(np.uint8), (0, 0), 4)
@@ -77,7 +76,7 @@ def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
     planes["KIND"][chosen], planes["FAR"][chosen] = ~fine[chosen], np.where(far[chosen], -1, 1)
     rays[int(cap_rays.HIDDEN) // 64, chosen] = rng.uniform(0.5, 1, len(chosen))
     expected = np.zeros((64, 3))
-    values = np.stack([words >> np.uint32(10 * channel) & np.uint32(1023) for channel in range(3)], -1) - float(BIAS)
+    values = np.stack([words >> np.uint32(8 * channel) & np.uint32(255) for channel in range(3)], -1) - float(BIAS)
     for lane in chosen:
         p = {name: float(plane[lane]) for name, plane in planes.items()}
         s, t = (part.ravel() for part in np.meshgrid(*(

@@ -45,14 +45,13 @@ def scene_of(camera: Camera, chamber: Chamber, depth: float) -> CapScene:
 )
 def test_rays_of_a_tile_are_those_of_the_tracer(view, place, radius, angle):
     """In ten-thousandths of a pixel of the frame, where the lens does not bend the lattice much."""
-    from rainstereo.compiled.cap_rays import GAIN, OWN, PLANES, Y_, fit
-    from rainstereo.compiled.cap_tiles import trace_lanes
+    from rainstereo.compiled.cap_rays import GAIN, OWN, PLANES, Y_, cross, fit, of_row, take_up
 
     camera, chamber, depth = VIEWS[view]
     limit = 5e-3 if view == "distorted" else 3e-4
     drop, scene = cap(*place, radius, angle), scene_of(camera, chamber, depth)
     outlines = Outlines.of([drop], camera, chamber)
-    table = CapTable.of(scene, [drop], outlines, np.zeros(1, np.intp))
+    table = CapTable.of(scene, [drop], np.zeros(1, np.intp))
     u, v = int(outlines.x[0]), int(outlines.y[0])
     tile, line = np.zeros((5, 3, 3), np.float32), np.zeros(15, np.float32)
     rays = np.zeros(PLANES * 64, np.float32)
@@ -62,7 +61,9 @@ def test_rays_of_a_tile_are_those_of_the_tracer(view, place, radius, angle):
     errors: list[float] = []
     for row in (-9.5, -3.0, 0.0, 4.5, 11.0):
         t, s = np.float32(v + row - v0), np.float32(u - 20.5 - u0)
-        trace_lanes(tile, t, s, 0, 40, table.columns[0], scene.lattice.later, scene.lattice.view, line, rays, OWN)
+        of_row(tile, t, line)
+        take_up(line, s, 0, 40, rays)
+        cross(table.columns[0], scene.lattice.later, scene.lattice.view, rays, 0, 40, OWN, False)
         pixels = np.stack([u - 20.5 + np.arange(40), np.full(40, v + row)], -1)
         seen = trace(pixels, drop, camera, chamber, depth)
         expected = seen.transmittance / clear_transmittance(pixels, camera, chamber)
@@ -163,48 +164,100 @@ def test_light_is_kept(drops, limit):
     assert np.abs(found.image - expected)[inside].max() < 15
 
 
-@pytest.mark.parametrize(
-    ("radius", "angle", "steps"), [(1.0, 70, (0.0, 1.0)), (0.5, 60, (0.7, 0.7)), (1.3, 80, (1.0, 0.2))]
-)
-def test_own_rays_stand_for_the_light_about_them(radius, angle, steps):
-    """Across the line where a cap turns dark: against the mean of 48 x 48 exact rays, weighted with their light."""
-    from rainstereo.compiled.cap_edges import RAYS, form_of, set_out, slopes_of_row, trace_own
-    from rainstereo.compiled.cap_rays import PLANES, SUB, WEIGHT, Y_, fit, of_row
+OWN_RAYS = [(1.0, 70, (0.0, 1.0)), (0.5, 60, (0.7, 0.7)), (1.3, 80, (1.0, 0.2))]
 
+
+class OwnRays:
+    """The rays of single pixels of one cap, as `compiled.cap_edges` traces them, and as `compiled.cap_light` does."""
+
+    def __init__(self, drop: SphericalCap) -> None:
+        from rainstereo.compiled.cap_light import room_for_light
+        from rainstereo.compiled.cap_rays import PLANES, fit
+
+        self.table = CapTable.of(scene_of(CAMERA, PANE, math.inf), [drop], np.zeros(1, np.intp))
+        self.tile, self.rays = np.zeros((5, 3, 3), np.float32), np.zeros(PLANES * 64, np.float32)
+        self.beams, self.noted, *_ = room_for_light()
+        self.outline = self.table.outlines[0]
+        self.middle = round(float(self.outline[0])), round(float(self.outline[1]))
+        self.origin = fit(self.table.nodes, self.table.columns[0], *self.middle, 20, self.tile)
+
+    def one_by_one(self, u: int, v: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Places, (RAYS, 2), and weights, (RAYS,), and the share of the pixel that the cap hides."""
+        from rainstereo.compiled.cap_edges import RAYS, form_of, set_out, slopes_of_row, trace_own
+        from rainstereo.compiled.cap_rays import SUB, WEIGHT, Y_, of_row
+
+        line, slopes = np.zeros(15, np.float32), np.zeros(12, np.float32)
+        t, s = np.float32(v - self.origin[1]), np.float32(u - self.origin[0])
+        of_row(self.tile, t, line)
+        slopes_of_row(self.tile, t, slopes)
+        form, table = form_of(u, v, self.outline, False, -1), self.table
+        hidden = set_out(
+            s, u, v, True, form, 0, table.columns, 0, -1, table.outlines, line, slopes, self.rays, np.uint64(0)
+        )  # fmt: skip
+        lattice, planes = table.scene.lattice, self.rays.reshape(-1, 64)
+        trace_own(table.columns[0], lattice.later, lattice.view, self.rays, RAYS)
+        x, y, weights = (planes[int(plane) // 64, :RAYS].copy() for plane in (SUB, SUB + Y_, WEIGHT))
+        return np.stack([x, y], -1), weights, hidden
+
+    def by_derivatives(self, u: int, v: int, hidden: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """The same, by derivatives at the pixel's middle."""
+        from rainstereo.compiled.cap_light import HALVES, trace_light
+        from rainstereo.compiled.cap_rays import PLANES, SUB, WEIGHT, Y_
+
+        noted, lattice = self.noted.reshape(5, -1), self.table.scene.lattice
+        noted[:4, :8] = np.array([u - self.origin[0], v - self.origin[1], hidden, 0.0])[:, None]
+        trace_light(
+            self.table.columns[0], self.outline, self.tile, *self.origin, lattice.later, lattice.view, self.noted, 0,
+            self.beams,
+        )  # fmt: skip
+        planes = self.beams.reshape(HALVES, PLANES, 8, 8)[..., 0]
+        x, y, weights = (planes[:, int(plane) // 64].reshape(-1) for plane in (SUB, SUB + Y_, WEIGHT))
+        return np.stack([x, y], -1), weights * noted[4, 0]
+
+
+@pytest.mark.parametrize("way", ["one by one", "by derivatives"])
+@pytest.mark.parametrize(("radius", "angle", "steps"), OWN_RAYS)
+def test_own_rays_stand_for_the_light_about_them(radius, angle, steps, way):
+    """Across the line where a cap turns dark: against the mean of 48 x 48 exact rays, weighted with their light."""
     drop = cap(0.4, -0.3, radius, angle)
-    table = CapTable.of(
-        scene_of(CAMERA, PANE, math.inf), [drop], Outlines.of([drop], CAMERA, PANE), np.zeros(1, np.intp)
-    )
-    tile, line, slopes = np.zeros((5, 3, 3), np.float32), np.zeros(15, np.float32), np.zeros(12, np.float32)
-    rays, outline = np.zeros(PLANES * 64, np.float32), table.outlines[0]
-    planes, lattice = rays.reshape(-1, 64), table.scene.lattice
-    middle = round(float(outline[0])), round(float(outline[1]))
-    u0, v0 = fit(table.nodes, table.columns[0], *middle, 20, tile)
+    rays = OwnRays(drop)
     along = (np.arange(48) + 0.5) / 48 - 0.5
-    places = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)
     partly = 0
-    for away in np.arange(2.0, float(outline[2])):
-        u, v = (int(m + round(away * step)) for m, step in zip(middle, steps, strict=True))
-        seen = trace(np.array([u, v]) + places, drop, CAMERA, PANE)
+    for away in np.arange(2.0, float(rays.outline[2])):
+        u, v = (int(m + round(away * step)) for m, step in zip(rays.middle, steps, strict=True))
+        seen = trace(np.array([u, v]) + grid, drop, CAMERA, PANE)
         gain = np.where(seen.status == Fate.THROUGH, seen.transmittance, 0)
         gain /= clear_transmittance(np.array([u, v], float), CAMERA, PANE)
-        t, s = np.float32(v - v0), np.float32(u - u0)
-        of_row(tile, t, line)
-        slopes_of_row(tile, t, slopes)
-        form = form_of(u, v, outline, False, -1)
-        set_out(
-            s, u, v, True, form, 0, table.columns, 0, -1, table.outlines, line, slopes, rays, np.uint64(0)
-        )  # fmt: skip
-        trace_own(table.columns[0], lattice.later, lattice.view, rays, RAYS)
-        weight = planes[int(WEIGHT) // 64, :RAYS]
-        assert abs(weight.sum() - gain.mean()) < 0.02
+        places, weights, hidden = rays.one_by_one(u, v)
+        if way == "by derivatives":
+            places, weights = rays.by_derivatives(u, v, hidden)
+        assert abs(weights.sum() - gain.mean()) < 0.02
         if 0 < (gain > 0).mean() < 1 and gain.mean() > 0.05:
             partly += 1
-            x = np.array([(planes[int(plane) // 64, :RAYS] * weight).sum() / weight.sum() for plane in (SUB, SUB + Y_)])
             lit = gain > 0
             expected = (seen.source[lit] * gain[lit, None]).sum(0) / gain.sum()
-            assert np.hypot(*(x - expected)) < 0.1 * np.ptp(seen.source[lit], axis=0).max()
+            found = (places * weights[:, None])[weights > 0].sum(0) / weights.sum()
+            assert np.hypot(*(found - expected)) < 0.1 * np.ptp(seen.source[lit], axis=0).max()
     assert partly or angle < 49
+
+
+@pytest.mark.parametrize(("radius", "angle", "steps"), OWN_RAYS)
+def test_rays_by_derivatives_are_those_traced_one_by_one(radius, angle, steps):
+    """From the middle to the rim, in parts of how far apart a pixel's rays are."""
+    rays, compared = OwnRays(cap(0.4, -0.3, radius, angle)), 0
+    for away in np.arange(1.0, float(rays.outline[2]) - 2.5):
+        u, v = (int(m + round(away * step)) for m, step in zip(rays.middle, steps, strict=True))
+        places, weights, hidden = rays.one_by_one(u, v)
+        found, others = rays.by_derivatives(u, v, hidden)
+        assert np.abs(others - weights).max() < 0.04 / len(weights)
+        both = np.minimum(weights, others)
+        if both.sum() > 0.02:
+            compared += 1
+            far = np.hypot(*(found - places)[both > 0].T)
+            apart = np.sqrt(np.ptp(places[both > 0], axis=0).max() ** 2 + 1)
+            assert np.average(far, weights=both[both > 0]) < 0.03 * apart
+    assert compared > 3
 
 
 def test_what_is_said_of_pixels_is_what_is_drawn():
