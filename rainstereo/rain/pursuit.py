@@ -203,6 +203,7 @@ class Pursuit:
         (pairs, begin, variance), scale = words.pairs, 0.5**level
         last = tuple(np.float32(n - 1) for n in self.size)
         rays = np.stack([x.T, y.T, *(step.T for step in steps), weights.T], axis=1)
+        first = np.ascontiguousarray(first)  # as `compile_ahead` has it: another layout would be compiled anew
         choose(
             words.lags, pairs, begin, variance, _atoms(), shapes, self._prices(level), np.float32(FRESH) * variance,
             SCREENED, OFFERED, ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each,
