@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import gc
 import math
 import os
 import time
@@ -193,7 +194,9 @@ def processes() -> Iterator[tuple[int, int, str]]:
     torch.distributed.init_process_group("nccl" if device != "cpu" else "gloo")
     try:
         yield rank, world, device
+        torch.distributed.barrier()  # they leave together
     finally:
+        gc.collect()  # wrapped networks: a process that ends with one may be aborted (`terminate called`, torch 2.13)
         torch.distributed.destroy_process_group()
 
 
