@@ -159,7 +159,7 @@ def _traced(
 
         def to_cap(here: Any, i: Lanes, j: Lanes) -> Lanes:
             before = begun + i * (along + i * bend_s + j * mixed) + j * (down + j * bend_t)
-            mean, squared, _ = of_light(before * before + (1.0 - q), soft, sharp)
+            mean, squared = of_light(before * before + (1.0 - q), soft, sharp)
             share = _cut(inside + i * inside_s + j * inside_t)
             put(here, (KX, mean), (KY, squared), (KZ, before), (SHARE, share))
             return share

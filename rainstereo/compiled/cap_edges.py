@@ -1,4 +1,5 @@
-"""Pixels that only some light reaches, or several caps show: each has 16 rays of its own, which look at one box each.
+"""Pixels that several caps show, or tiny ones: each has 16 rays of its own, which look at one box each. As have pixels
+that only some light reaches (`cap_light`).
 
 How large a box is follows from how far from the drop the ray looks: as many times as far as it is from the drop's
 middle are also rays apart that pass the middle as far away. Towards the middle, where the cap turns dark, what a ray
@@ -61,6 +62,7 @@ SOFTEST = np.float32(1e-3)  # less is lost in rounding
 NOWHERE = np.uint32((1 << 32) - 1)
 WHITE = np.float32(255)
 SIZE_BITS, NO_BOX = 27, 31
+SIZE_SHIFT, REST, NO_SIZE = np.uint32(SIZE_BITS), np.uint32((1 << SIZE_BITS) - 1), np.uint32(NO_BOX)
 """From which bit on a box's number holds its size; and the size that is the image itself."""
 
 
@@ -225,16 +227,20 @@ def boxes_of_rays(
 
 
 @fused_part
+def box_of(box: Any, starts: Any) -> Any:
+    """The number among all of a box from `boxes_of_rays`."""
+    return np.uint64(starts[np.uint64(box >> SIZE_SHIFT)]) + np.uint64(box & REST)
+
+
+@fused_part
 def call_boxes(words: Any, starts: Any, lanes: Any, at: Any) -> bool:
     """Have the boxes of rays brought from memory, `at` from `boxes_of_rays`, which gets their numbers among all; or
     `NOWHERE` for those that look at the image itself. Returns whether some do."""
-    bits, rest, nothing, alone = np.uint64(SIZE_BITS), np.uint64((1 << SIZE_BITS) - 1), np.uint64(0), False
+    alone = False
     for j in range(np.uint64(lanes)):
-        box = np.uint64(at[j])
-        size = box >> bits
-        none = size == np.uint64(NO_BOX)
+        none = at[j] >> SIZE_SHIFT == NO_SIZE
         alone |= none
-        number = nothing if none else np.uint64(starts[size]) + (box & rest)
+        number = np.uint64(0) if none else box_of(at[j], starts)
         to_read(words, number)
         at[j] = NOWHERE if none else np.uint32(number)
     return alone
@@ -289,15 +295,14 @@ def own_of_row(
     line: Any, slopes: Any, rays: Any, beams: Any, made: Any, at: Any, pixels: Any, hidden: Any, shown: Any,
     width: Any, out: Any,
 ) -> Any:  # fmt: skip
-    """Draw those pixels of a row that have rays of their own, as soon as there are `TOGETHER` of them; take them out of
-    `HIDDEN`. Returns how many are left, set out among `beams`; made: how many were.
+    """Draw those pixels of a row that several caps, or a tiny one, show, as soon as there are `TOGETHER` of them; take
+    them out of `HIDDEN`. Returns how many are left, set out among `beams`; made: how many were.
 
     u, v: column of lane 0, and row. line, slopes: of the row. beams: rays of these pixels, planes as `rays` has. at:
     (64,) uint32; pixels, hidden: (`TOGETHER`,) of each the number of its first byte in `out`, and the share hidden.
     """
     for each in range(np.uint64(64)):
-        others = rays[HIDDEN + each] if rays[RIVAL + each] > ZERO else ZERO
-        rays[MARK + each] = rays[HIDDEN + each] if tiny or rays[LITS + each] == ONE else others
+        rays[MARK + each] = rays[HIDDEN + each] if tiny or rays[RIVAL + each] > ZERO else ZERO
     left = lanes_from(above_zero(rays, MARK), low, high)
     while left:
         j = lowest(left)
@@ -312,7 +317,7 @@ def own_of_row(
                 at_s, u + lane, v, near, form, number, caps, number, rival, outlines, line, slopes, beams,
                 LANES * np.uint64(made),
             )  # fmt: skip
-            pixels[made], hidden[made] = pixel, max(share, before) if hangs and not tiny else min(share, ONE)
+            pixels[made], hidden[made] = pixel, min(share, ONE)
             made += 1
             if made == TOGETHER:
                 draw_own(

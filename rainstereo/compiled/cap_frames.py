@@ -22,11 +22,11 @@ from .cap_edges import (
     slopes_of_row,
     trace_own,
 )
-from .cap_light import draw_light, note_light, one_light, room_for_light
+from .cap_light import draw_light, keep_to_boxes, note_light, one_light, room_for_light
 from .cap_looks import is_whole, show_alone
 from .cap_patches import PLACES, show_whole, whole_of_row
 from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit
-from .cap_records import PIXELS, TAPS, add_places, record_light, record_rays, record_whole
+from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
 from .cap_tiles import (
     AXX,
@@ -198,7 +198,8 @@ def record_row(
             )  # fmt: skip
             off = add_places(rays, shift, last, mean)
             boxes_of_rays(outlines[number], last, shift, border, len(starts), rays, RAYS, at)
-            record_light(starts, rays, at, texels, weights, cursor, filling)
+            keep_to_boxes(at, RAYS)
+            record_rays(starts, size, rays, at, boxes, texels, weights, cursor, filling)
         elif low <= lane < high and has_own(rays, lane, tiny):
             rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
             near = bool(rival >= 0 or not rays[ROOM + j] > edge)

@@ -123,13 +123,13 @@ def _arguments(rays: Any, count: int) -> Any:
     return types.void(rays, types.uint64, types.uint64, types.uint64, *[types.float32] * count)
 
 
-def of_light(inside: Lanes, spread: Lanes, per: Lanes) -> tuple[Lanes, Lanes, Lanes]:
-    """Of light about rays, behind the cap: the mean of the component along the normal, the mean of its square, and the
-    largest square; per: 1 / spread. See `cap_rays.cross`."""
+def of_light(inside: Lanes, spread: Lanes, per: Lanes) -> tuple[Lanes, Lanes]:
+    """Of light about rays, behind the cap: the mean of the component along the normal, 0 in the dark, and the mean of
+    its square; per: 1 / spread. See `cap_rays.cross`."""
     high, low = inside + spread, inside - spread
     high, low = high.where(high.above(0.0)), low.where(low.above(0.0))
     mean = (high * high.root() - low * low.root()) * (per * (1 / 3))
-    return mean, (high + low) * (high - low) * (per * 0.25), high
+    return mean, (high + low) * (high - low) * (per * 0.25)
 
 
 def refracted(before: Lanes, mean: Lanes, square: Lanes, curvature: Lanes, q: Lanes) -> tuple[Lanes, Lanes, Lanes]:
@@ -163,7 +163,7 @@ def _through_cap(soft: bool) -> Callable[..., None]:
         before = root * curvature  # component of the wave vector along the sphere's normal
         inside = before * before + (1.0 - q)
         if soft:
-            mean, squared, inside = of_light(inside, at(spread_), at(sharp_))
+            mean, squared = of_light(inside, at(spread_), at(sharp_))
         else:
             squared, mean = inside, inside.root()
         bend, passed, stretch = refracted(before, mean, squared, curvature, q)
@@ -179,7 +179,7 @@ def _through_cap(soft: bool) -> Callable[..., None]:
         put(KY, ky + bend * py)
         put(KZ, up)
         # beside the contact circle the sphere goes on below the face, for pixels at the edge, unless it hangs over
-        lit = builder.and_(builder.or_(towards, room.above(0.0)), builder.and_(inside.above(0.0), up.above(0.0)))
+        lit = builder.and_(builder.or_(towards, room.above(0.0)), builder.and_(mean.above(0.0), up.above(0.0)))
         (passed * dim).where(lit).put(data, there(GAIN))
 
     return body

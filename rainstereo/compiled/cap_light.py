@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .cap_beams import BEAMS, HALVES, NOTED, TOGETHER, summed, traced
-from .cap_edges import NO_BOX, RAYS, SIZE_BITS, WHITE, boxes_of_rays
+from .cap_edges import NO_SIZE, RAYS, REST, SIZE_SHIFT, WHITE, box_of, boxes_of_rays
 from .cap_rays import (
     CAP_CURVATURE,
     CAP_DEPTH,
@@ -37,7 +37,6 @@ from .compile import fused, fused_part
 from .prefetch import to_read
 
 EIGHT = np.uint64(WIDE)
-SIZE_SHIFT, REST, NOTHING = np.uint32(SIZE_BITS), np.uint32((1 << SIZE_BITS) - 1), np.uint32(NO_BOX)
 PLACE, PLACE_DOWN, SHARE_HIDDEN, HANGS, UNIT = (NOTED * k for k in range(5))
 """Planes of what is noted: see `cap_beams.traced`."""
 
@@ -117,15 +116,10 @@ def one_light(
 
 
 @fused_part
-def smallest(box: Any) -> Any:
-    """A box from `boxes_of_rays`; the smallest there is where it would be the image itself."""
-    return box & REST if box >> SIZE_SHIFT == NOTHING else box
-
-
-@fused_part
-def box_of(box: Any, starts: Any) -> Any:
-    """Its number among all."""
-    return np.uint64(starts[np.uint64(box >> SIZE_SHIFT)]) + np.uint64(box & REST)
+def keep_to_boxes(at: Any, lanes: Any) -> None:
+    """Let rays look at the smallest box there is where it would be the image itself; at: see `boxes_of_rays`."""
+    for j in range(np.uint64(lanes)):
+        at[j] = at[j] & REST if at[j] >> SIZE_SHIFT == NO_SIZE else at[j]
 
 
 @fused_part
@@ -137,9 +131,9 @@ def call_light(
     for half in range(HALVES):
         rays = beams[half * PLANES * 64 : (half + 1) * PLANES * 64]
         boxes_of_rays(outline, last, shift, border, len(starts), rays, 64, boxes)
+        keep_to_boxes(boxes, 64)
         for j in range(np.uint64(64)):
             weights[to + j] = rays[WEIGHT + j]
-            boxes[j] = smallest(boxes[j])
         for j in range(np.uint64(64)):
             number = box_of(boxes[j], starts)
             to_read(words, number)

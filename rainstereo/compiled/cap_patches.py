@@ -1,8 +1,8 @@
 """Pixels shown as whole patches of the scene, eight of a row side by side: each lane of a vector is a pixel, and their
 looks come one after the other.
 
-First the boxes that a row's pixels look at are found and called for, then, when they have come from memory, summed.
-Both are written in LLVM's own language, as in `cap_lanes`.
+The boxes that eight pixels look at are found and called for, all of them, before they are summed. Both are written in
+LLVM's own language, as in `cap_lanes`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .boxes import BITS
 from .cap_lanes import Lanes
 from .cap_looks import BIAS, EDGE, INSIDE, MIRROR
 from .cap_rays import HIDDEN, MARK, PATCH, RIVAL, SHOWN, ZERO
-from .cap_tiles import ACROSS, AIMS, DOWN, FAR, GAINS, KIND, LITS, SIZE, TILE, WHOLE
+from .cap_tiles import ACROSS, AIMS, DOWN, FAR, GAINS, KIND, LITS, SIZE, WHOLE
 from .cap_vectors import FIELD, REALS, WIDE, WORDS, above, above_zero, lanes_from, lowest
 from .compile import fused_part
 from .llvm import BYTE, FOUR, LONG, alike, arguments, ir, load, spread, store
@@ -25,9 +25,7 @@ from .prefetch import call
 
 EIGHT, LANES = np.uint64(WIDE), np.uint64(0xFF)
 MOST = 64  # looks a pixel
-ROOM = np.uint64(MOST * WIDE)
-PLACES = 2 * (TILE // WIDE) * MOST * WIDE
-"""Of the boxes of a row: those of a vector's pixels may be of both bands."""
+PLACES = MOST * WIDE  # of the boxes of eight pixels
 
 
 def _plane(builder: Any, rays: Any, lane: Any) -> Any:

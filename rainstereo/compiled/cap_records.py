@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .cap_edges import LANES, NO_BOX, SIZE_BITS
-from .cap_light import box_of, smallest
+from .cap_edges import LANES, NO_SIZE, SIZE_SHIFT, box_of
 from .cap_looks import INSIDE, look_at, look_at_box, sides
 from .cap_rays import HIDDEN, ONE, SUB, WEIGHT, Y_, ZERO
 from .cap_tiles import ACROSS, DOWN, FAR, GAINS, KIND, SIZE
@@ -72,29 +71,18 @@ def record_whole(
 
 
 @fused
-def record_light(
-    starts: Any, rays: Any, at: Any, texels: Any, weights: Any, cursor: Any, filling: bool
-) -> None:  # fmt: skip
-    """The taps of a pixel whose rays are as `cap_light` draws them; at: see `cap_edges.boxes_of_rays`."""
-    for j in range(LANES):
-        if rays[WEIGHT + j] > ZERO:
-            _tap(texels, weights, cursor, filling, np.int64(box_of(smallest(at[j]), starts)), rays[WEIGHT + j])
-
-
-@fused
 def record_rays(
     starts: Any, size: Any, rays: Any, at: Any, first: Any, texels: Any, weights: Any, cursor: Any, filling: bool,
 ) -> None:  # fmt: skip
     """The taps of a pixel with rays of its own, see `cap_edges.boxes_of_rays`."""
     for j in range(LANES):
-        weight, box = rays[WEIGHT + j], np.int64(at[j])
+        weight = rays[WEIGHT + j]
         if not weight > ZERO:
             continue
-        kind = box >> SIZE_BITS
-        if kind == NO_BOX:
+        if at[j] >> SIZE_SHIFT == NO_SIZE:
             _bilinear(texels, weights, cursor, filling, first, size, rays[SUB + j], rays[SUB + Y_ + j], weight)
         else:
-            _tap(texels, weights, cursor, filling, starts[kind] + (box & ((1 << SIZE_BITS) - 1)), weight)
+            _tap(texels, weights, cursor, filling, np.int64(box_of(at[j], starts)), weight)
 
 
 @fused_part
