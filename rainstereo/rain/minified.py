@@ -322,7 +322,7 @@ def _sum(planes: Array) -> Array:
 
 
 def _kind(samples: Samples) -> Status:
-    """What pixels, (M,), show: nothing of a drop, only darkness, or the scene."""
+    """What pixels, (M,), show: nothing of a drop, only darkness, or the scene, if only in a gap between dark drops."""
     kind: Status = np.full(samples.gain.shape[1], LIT, dtype=np.uint8)
     kind[~samples.gain.any(0) & samples.opacity.all(0)] = DARK
     kind[~samples.opacity.any(0)] = NOTHING

@@ -114,6 +114,21 @@ def test_within_a_gray_level_of_many_rays_a_pixel(name, side):
     np.testing.assert_array_equal(found.image[found.opacity == 0], image[found.opacity == 0])
 
 
+@pytest.mark.parametrize("lasting", [False, True])
+@pytest.mark.parametrize("gap", [0.3, 0.6, 1.0])
+def test_gaps_between_dark_rims(gap, lasting):
+    """Three steep drops, dark at their rims, each so many pixels from the others: what is between them is not dark."""
+    apart = 2 + gap * 60 / 800  # millimetres; the face is 60 away
+    drops = [cap(*place, 1.0, 85) for place in ((-apart / 2, 0), (apart / 2, 0), (0, -apart * math.sqrt(0.75)))]
+    image = photograph()
+    expected, covered = brute_force(image, drops, CAMERA, PANE, DEPTH, 24)
+    found = Renderer(CAMERA, PANE, DEPTH, lasting=lasting).plan(drops).render(image)
+    between = (covered > 0) & (covered < 1) & (cv2.dilate(np.uint8(covered == 0), np.ones((3, 3), np.uint8)) == 0)
+    assert np.count_nonzero(between) >= 10
+    assert np.abs(found.opacity - covered).max() <= 0.1
+    assert np.abs(found.image - expected)[between].max() <= 15
+
+
 @pytest.mark.parametrize("side", [8, 24])
 def test_tolerance_trades_looks_for_error(side):
     image, drops = photograph(), SCENES["lone"][1]
