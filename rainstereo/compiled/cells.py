@@ -13,6 +13,8 @@ from .quads import quad_of
 
 U = np.uint64
 EIGHT = U(LANES)
+SOON = U(3)
+"""Eights by which the memory of pixels is asked for before they are written: those of a cell lie all over the frame."""
 
 
 @compiled
@@ -100,20 +102,20 @@ def draw(
     pixels: (M,) uint32, M a multiple of 8. most, places, weights: of `interleave`. roundings: (M,) int16, units of
     weights, for every channel.
     """
-    unit, tap, held = np.uint32(shift), U(0), U(0)
+    unit, tap, held, last = np.uint32(shift), U(0), U(0), U(len(most)) - U(1)
     for i in range(U(len(pieces))):
         copy_eight(row, EIGHT * U(pieces[i]), near, held)
         held += EIGHT
     for i in range(U(len(soft))):
         near[held + i] = quad_of(below, U(soft[i]))
     for eight in range(U(len(most))):
-        number, start = eight * EIGHT, tap
+        number, later, start = eight * EIGHT, min(eight + SOON, last) * EIGHT, tap
         tap += U(most[eight]) * EIGHT
         if channels == 1:
-            one_channel(out, near, unit, pixels, number, places, weights, start, tap, roundings)
+            one_channel(out, near, unit, pixels, number, later, places, weights, start, tap, roundings)
         elif channels == 2:
-            two_channels(out, near, unit, pixels, number, places, weights, start, tap, roundings)
+            two_channels(out, near, unit, pixels, number, later, places, weights, start, tap, roundings)
         elif channels == 3:
-            three_channels(out, near, unit, pixels, number, places, weights, start, tap, roundings)
+            three_channels(out, near, unit, pixels, number, later, places, weights, start, tap, roundings)
         else:
-            four_channels(out, near, unit, pixels, number, places, weights, start, tap, roundings)
+            four_channels(out, near, unit, pixels, number, later, places, weights, start, tap, roundings)

@@ -11,11 +11,14 @@ from typing import Any
 from numba.core import types
 from numba.extending import intrinsic
 
+from . import prefetch
 from .layout import LANES
 from .llvm import BYTE, FOUR, LONG, TWO, alike, arguments, ir, load, spread, store
 
 VECTOR, SHORTS = ir.VectorType(FOUR, LANES), ir.VectorType(TWO, LANES)
 LAST = 255
+AHEAD = 512
+"""Taps by which memory is asked for before it is needed: a frame's are too many for the caches, and are read once."""
 
 
 def _summing(channels: int) -> Any:
@@ -23,29 +26,33 @@ def _summing(channels: int) -> Any:
 
     @intrinsic
     def eight(
-        _context: Any, out: Any, quads: Any, shift: Any, pixels: Any, row: Any, places: Any, weights: Any, first: Any,
-        end: Any, roundings: Any,
+        _context: Any, out: Any, quads: Any, shift: Any, pixels: Any, row: Any, later: Any, places: Any, weights: Any,
+        first: Any, end: Any, roundings: Any,
     ) -> Any:  # fmt: skip
         def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             _write(builder, channels, *arguments(context, builder, signature, given))
             return context.get_dummy_value()
 
-        number = types.uint64
-        return types.void(out, quads, types.uint32, pixels, number, places, weights, number, number, roundings), code
+        long = types.uint64
+        return types.void(out, quads, types.uint32, pixels, long, long, places, weights, long, long, roundings), code
 
     return eight
 
 
 def _write(
-    builder: Any, channels: int, out: Any, quads: Any, shift: Any, pixels: Any, row: Any, places: Any, weights: Any,
-    first: Any, end: Any, roundings: Any,
+    builder: Any, channels: int, out: Any, quads: Any, shift: Any, pixels: Any, row: Any, later: Any, places: Any,
+    weights: Any, first: Any, end: Any, roundings: Any,
 ) -> None:  # fmt: skip
+    for lane in range(LANES):
+        prefetch.call(builder, out, _first_byte(builder, channels, pixels, later, lane), 1)
     start = builder.sext(load(builder, roundings, row, SHORTS), VECTOR)
     before, loop, after = builder.block, builder.append_basic_block("tap"), builder.append_basic_block("write")
     builder.branch(loop)
 
     builder.position_at_end(loop)  # one tap of each pixel: quads are fetched one by one, and weighted together
     tap, sums = builder.phi(LONG), [builder.phi(VECTOR) for _ in range(channels)]
+    for table in (places, weights):
+        prefetch.call(builder, table, builder.add(tap, ir.Constant(LONG, AHEAD)))
     factors = builder.sext(load(builder, weights, tap, SHORTS), VECTOR)
     found = ir.Constant(VECTOR, ir.Undefined)
     for lane in range(LANES):
@@ -71,9 +78,14 @@ def _write(
         level = builder.select(builder.icmp_signed("<", level, alike(VECTOR, LAST)), level, alike(VECTOR, LAST))
         shown = builder.or_(shown, builder.shl(level, alike(VECTOR, 8 * channel)))
     for lane in range(LANES):
-        pixel = builder.zext(builder.load(builder.gep(pixels, [builder.add(row, ir.Constant(LONG, lane))])), LONG)
-        at = builder.gep(out, [builder.mul(pixel, ir.Constant(LONG, channels))])
+        at = builder.gep(out, [_first_byte(builder, channels, pixels, row, lane)])
         _store(builder, builder.extract_element(shown, ir.Constant(FOUR, lane)), at, channels)
+
+
+def _first_byte(builder: Any, channels: int, pixels: Any, row: Any, lane: int) -> Any:
+    """Number in the frame of the first byte of the pixel of a row."""
+    pixel = builder.zext(builder.load(builder.gep(pixels, [builder.add(row, ir.Constant(LONG, lane))])), LONG)
+    return builder.mul(pixel, ir.Constant(LONG, channels))
 
 
 def _store(builder: Any, value: Any, at: Any, channels: int) -> None:
@@ -100,8 +112,8 @@ def _copy(_context: Any, source: Any, _first: Any, target: Any, _to: Any) -> Any
 copy_eight: Any = _copy
 """copy_eight(source, first, target, to): eight numbers of 32 bits, from the number `first` on to the number `to`."""
 one_channel, two_channels, three_channels, four_channels = (_summing(channels) for channels in (1, 2, 3, 4))
-"""three_channels(out, quads, shift, pixels, row, places, weights, first, end, roundings): the pixels of rows row to
-row + 7.
+"""three_channels(out, quads, shift, pixels, row, later, places, weights, first, end, roundings): the pixels of rows row
+to row + 7. later: eight rows whose pixels in `out` will be written soon: hints to fetch their memory.
 
 out: (P * 3,) uint8. quads: (N,) uint32. shift: uint32, bits of a weight's unit. pixels: (M,) uint32. places, weights:
 (T,) uint16, int16 of taps: those of the rows from the number `first` to before `end`, interleaved
