@@ -100,7 +100,7 @@ def test_plans_that_last_are_held_in_pairs(monkeypatch):
     image = np.random.default_rng(6).integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
     drop = SphericalCap((0.001, 0.002), 8e-4, 0.8)
     wide = Renderer(camera, PANE, lasting=True).plan(drop)
-    monkeypatch.setattr(minified, "LARGE", 1000)
+    monkeypatch.setattr(minified, "LARGE", 500)
     held = Renderer(camera, PANE, lasting=True).plan(drop)
     assert {type(table.texels.taps) for table in held.tables} == {PairTaps}
     assert min(table.weights[:].min() for table in held.tables) < 0
