@@ -24,7 +24,7 @@ from .windows import Column, PairTaps, WindowTaps
 JOINED = 1 << 20  # taps up to which tables are joined: both stand in memory meanwhile
 ROW = 8  # taps that the rest of a row is as dear as
 ROWS = 1 << 14  # that are moved at a time
-TILE = 256  # pixels of the scene
+TILE = 128  # pixels of the scene
 BITS = 10  # of the number of a tile, along an axis
 
 
