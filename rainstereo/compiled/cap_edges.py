@@ -214,8 +214,8 @@ def boxes_of_rays(
         none = size < -one
         size = size if size > zero else zero
         size = size if size < most else most
-        coarser = (size - np.int32(3)) >> one  # pixels between boxes: `rain.boxes`
-        bits = (coarser if coarser > zero else zero) + one
+        coarser, other = (size - np.int32(3)) >> one, (size + one) >> np.int32(2)  # pixels between boxes: `rain.boxes`
+        bits = (coarser if coarser > other else other) + one
         inverse = np.int32((exponent - bits) << np.int32(23)).view(np.float32)
         pitch = (wide >> bits) + np.int32(2)
         x, y = folded(x, last[0], border), folded(y, last[1], border)

@@ -126,11 +126,11 @@ def frame(
                         continue
                     for j in range(np.uint64(3 * 64)):
                         rays[SHOWN + j] = ZERO
-                    every, fine = whole_of_row(begin, end, rays)
+                    every = whole_of_row(begin, end, rays)
                     if tiny:
-                        every = fine = NONE
+                        every = NONE
                     alone = every & ~above(rays, SIZE, -HALF)
-                    every, fine = every & ~alone, fine & ~alone
+                    every &= ~alone
                     if not tiny:
                         waiting = note_light(
                             s, t, v * width + u1, scene.shape[2], low, high, hangs, rays, light, waiting,
@@ -148,7 +148,7 @@ def frame(
                             total, width, out,
                         )  # fmt: skip
                     if every:
-                        show_whole(every, fine, words, starts, last, border, bands, rays, places, parts)
+                        show_whole(every, words, starts, last, border, rays, places, parts)
                     while alone:
                         show_alone(scene, last, border, rays, lowest(alone), total)
                         alone &= alone - ONE_LANE

@@ -1,7 +1,7 @@
 """What whole patches of the scene show: means over looks at boxes of the image (`boxes`).
 
-A patch is sampled on a grid of looks, more along its longer side, each at the box of its part's size that is nearest;
-small patches by fewer, each a mean of the four nearest.
+A patch is sampled on a grid of looks, more along its longer side, each a mean of the four boxes of its part's size that
+are nearest, weighted by how near.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .cap_rays import FOUR, HALF, HIDDEN, ONE, RIVAL, SHOWN, ZERO
+from .cap_rays import HALF, HIDDEN, ONE, RIVAL, SHOWN, ZERO
 from .cap_tiles import (
     ABX,
     ABY,
@@ -37,6 +37,7 @@ BIAS = np.float32(0.125)
 """Gray levels by which words are too large: halves are rounded up where an image is halved."""
 MIRROR, EDGE, INSIDE = 0, 1, 2
 """How the scene goes on beyond its edges; or that nothing lies beyond them."""
+EIGHTHS = np.float32(8)
 FARTHEST = np.float32(1e6)  # pixels; what lies beyond is not told apart
 MOST = 12
 """Looks along a small patch's side."""
@@ -105,14 +106,14 @@ def patch_of_pixels(scene: Any, last: Any, border: Any, rays: Any, j: Any, total
 
 @fused_part
 def look_at_box(
-    fine: bool, start: Any, pitch: Any, inverse: Any, last: Any, border: Any, rays: Any, j: Any, a: Any, b: Any
+    start: Any, pitch: Any, inverse: Any, last: Any, border: Any, rays: Any, j: Any, a: Any, b: Any
 ) -> Any:  # fmt: skip
-    """The number of the box that look a, b of a patch falls to; fine: of the upper left of four boxes, and how far it
-    lies from that, quarters of their distance along and down.
+    """The number of the upper left of the four boxes that look a, b of a patch falls between, and how far it lies from
+    that, parts of their distance along and down, in eighths.
 
     start, pitch, inverse: of the boxes' size. border: `INSIDE`, if all looks of the patch are.
     """
-    one = inverse * FOUR if fine else inverse
+    one = inverse * EIGHTHS
     s = (np.float32(a) + HALF) / rays[ACROSS + j] - HALF
     t = (np.float32(b) + HALF) / rays[DOWN + j] - HALF
     x, y = place_on(rays, j, s, t)
@@ -120,9 +121,8 @@ def look_at_box(
         x, y = folded(x, last[0], border), folded(y, last[1], border)
     middle = HALF * one + HALF
     column, row = np.int64(x * one + middle), np.int64(y * one + middle)
-    if fine:
-        return start + (row >> 2) * pitch + (column >> 2), column & 3, row & 3
-    return start + row * pitch + column, np.int64(0), np.int64(0)
+    u, v = np.float32(column & 7) / EIGHTHS, np.float32(row & 7) / EIGHTHS
+    return start + (row >> 3) * pitch + (column >> 3), u, v
 
 
 @fused_part

@@ -9,7 +9,7 @@ import numpy as np
 from .cap_edges import LANES, NO_SIZE, SIZE_SHIFT, box_of
 from .cap_looks import INSIDE, look_at, look_at_box, sides
 from .cap_rays import HIDDEN, ONE, SUB, WEIGHT, Y_, ZERO
-from .cap_tiles import ACROSS, DOWN, FAR, GAINS, KIND, SIZE
+from .cap_tiles import ACROSS, DOWN, FAR, GAINS, SIZE
 from .compile import fused, fused_part
 
 PIXELS, TAPS = 0, 1  # counters
@@ -58,16 +58,11 @@ def record_whole(
     on, part = border if not rays[FAR + j] >= ZERO else INSIDE, gain / (rays[ACROSS + j] * rays[DOWN + j])
     for b in range(np.int64(rays[DOWN + j])):
         for a in range(np.int64(rays[ACROSS + j])):
-            if rays[KIND + j] == ZERO:
-                box, right, low = look_at_box(True, start, pitch, inverse, last, on, rays, j, a, b)
-                u, v = np.float32(right) / np.float32(4), np.float32(low) / np.float32(4)
-                _tap(texels, weights, cursor, filling, box, part * (ONE - v) * (ONE - u))
-                _tap(texels, weights, cursor, filling, box + 1, part * (ONE - v) * u)
-                _tap(texels, weights, cursor, filling, box + pitch, part * v * (ONE - u))
-                _tap(texels, weights, cursor, filling, box + pitch + 1, part * v * u)
-            else:
-                box, _, _ = look_at_box(False, start, pitch, inverse, last, on, rays, j, a, b)
-                _tap(texels, weights, cursor, filling, box, part)
+            box, u, v = look_at_box(start, pitch, inverse, last, on, rays, j, a, b)
+            _tap(texels, weights, cursor, filling, box, part * (ONE - v) * (ONE - u))
+            _tap(texels, weights, cursor, filling, box + 1, part * (ONE - v) * u)
+            _tap(texels, weights, cursor, filling, box + pitch, part * v * (ONE - u))
+            _tap(texels, weights, cursor, filling, box + pitch + 1, part * v * u)
 
 
 @fused

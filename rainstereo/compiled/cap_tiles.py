@@ -48,20 +48,19 @@ OUT_X, OUT_Y, OUT_RADIUS, OUT_RIVAL, OUT_RIVALS = range(5)
 """Columns of a table of outlines, float64: a circle in the image, and which of the list of rivals are the cap's."""
 WHOLE, PARTLY = np.float32(2), np.float32(1)
 """Of a pixel's rays beside it, whether all or only some are lit."""
-CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, SIZE, ACROSS, DOWN, KIND, FAR, LITS = (
-    PATCH + np.uint64(64 * i) for i in range(19)
+CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, SIZE, ACROSS, DOWN, FAR, LITS = (
+    PATCH + np.uint64(64 * i) for i in range(18)
 )  # fmt: skip
 """Planes of patches: the middle of what a pixel shows; how places change along x (A) and y (B), twice along each, and
-along both; mean gain; the size of boxes, -1: the image itself; looks across and down; 0 in the first band; pixels
-between what it shows and the scene's edge, at least; `WHOLE`, `PARTLY` or 0."""
-AREAS, AIMS, PARTS = range(3)
-"""Columns of a table of two bands: up to which area of a patch, how many looks it gets, and which part of the patch's
-area a box has. Looks of the first are at four boxes each."""
+along both; mean gain; the size of boxes, -1: the image itself; looks across and down; pixels between what it shows and
+the scene's edge, at least; `WHOLE`, `PARTLY` or 0."""
+AREAS, AIMS = range(2)
+"""Columns of a table of two bands: up to which area of a patch, and how many looks it gets."""
 SMALLEST = np.float32(math.sqrt(2) / 16)
 """1 / the square of the side up to which boxes are the smallest: a quarter octave above their own."""
-LARGEST = np.float32(110 * 110)
+LARGEST = np.float32(120 * 120)
 """Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
-LARGEST_ALONE = np.float32(64 * 64)
+LARGEST_ALONE = np.float32(80 * 80)
 """The same where a neighbour's middle is dark, so that it is less sure how the patch is bent."""
 
 
@@ -202,29 +201,20 @@ def reach(ax: Any, bx: Any, axx: Any, bxx: Any, mixed: Any) -> Any:
 def patches(rays: Any, low: Any, high: Any, bands: Any, sizes: Any, shift: Any, last: Any) -> None:
     """The patches of lanes whose rays are known. shift: from the frame to the scene; last: the scene's last pixel.
 
-    bands: (2, 3), see `AREAS`. sizes: of boxes that there are.
+    bands: (2, 2), see `AREAS`. sizes: of boxes that there are.
     """
     dx, dy, end_x, end_y = shift[0], shift[1], last[0], last[1]
     small_area, aim0, aim1 = bands[0, AREAS], bands[0, AIMS], bands[1, AIMS]
-    part0, part1 = bands[0, PARTS], bands[1, PARTS]
     largest, nought, below = np.int32(sizes - 1), np.int32(0), np.int32(-1)
-    one, tiny, small, two, twelfth = (
-        np.uint64(1),
-        np.float32(1e-20),
-        np.float32(1 / 24),
-        np.float32(2),
-        np.float32(1 / 12),
-    )
+    one, tiny, small, two = np.uint64(1), np.float32(1e-20), np.float32(1 / 24), np.float32(2)
     for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
         before, after = rays[OWN + GAIN + j - one], rays[OWN + GAIN + j + one]
         known = (before if before < after else after) > ZERO
         g, ag, bg, agg, bgg, _ = bent(rays, GAIN + j, known, HALF)
         steep = ag * ag / (ag * ag + bg * bg + tiny)  # light ends there, and across that line places change
-        gain = g + (agg + bgg) * small
-        rays[GAINS + j] = gain
-        per = twelfth / gain  # what is brighter counts more: it is as if the middle lay there
+        rays[GAINS + j] = g + (agg + bgg) * small
         cx, ax, bx, axx, bxx, mixed = bent(rays, j, known, steep)
-        cx += dx + (ag * ax + bg * bx) * per
+        cx += dx
         out = reach(ax, bx, axx, bxx, mixed)
         p, q, over = cx - out, end_x - cx - out, out - end_x
         far = p if p < q else q
@@ -235,7 +225,7 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, sizes: Any, shift: Any, 
         rays[BXX + j] = bxx
         rays[ABX + j] = mixed
         cy, ay, by, ayy, byy, mixed = bent(rays, Y_ + j, known, steep)
-        cy += dy + (ag * ay + bg * by) * per
+        cy += dy
         out = reach(ay, by, ayy, byy, mixed)
         p, q = cy - out, end_y - cy - out
         over = over if over > out - end_y else out - end_y
@@ -254,21 +244,21 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, sizes: Any, shift: Any, 
         ax, ay, bx, by = rays[AX + j], rays[AY + j], rays[BX + j], rays[BY + j]
         most = rays[SIZE + j]
         area = abs(ax * by - ay * bx)
-        aim, part, kind = (aim0, part0, ZERO) if area < small_area else (aim1, part1, np.float32(1))
-        rays[KIND + j] = kind
-        octaves = (np.float32(area * part * SMALLEST).view(np.int32) >> np.int32(23)) - np.int32(127)
-        size = octaves if octaves > nought else nought
-        size = size if size < largest else largest
-        rays[SIZE + j] = np.float32(size if octaves >= below else below)
-        lights = rays[LITS + j]
-        rays[LITS + j] = lights if area < most or not lights > PARTLY else PARTLY
+        aim = aim0 if area < small_area else aim1
         ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))
         across = np.float32(math.sqrt(aim * np.float32(math.sqrt(ratio)))) + HALF
         across = across if across < HALF * aim else HALF * aim
         across = np.float32(np.int32(across if across > two else two))
         down = np.float32(np.int32(aim / across))
+        down = down if down > two else two
         rays[ACROSS + j] = across
-        rays[DOWN + j] = down if down > two else two
+        rays[DOWN + j] = down
+        octaves = (np.float32(area / (across * down) * SMALLEST).view(np.int32) >> np.int32(23)) - np.int32(127)
+        size = octaves if octaves > nought else nought
+        size = size if size < largest else largest
+        rays[SIZE + j] = np.float32(size if octaves >= below else below)
+        lights = rays[LITS + j]
+        rays[LITS + j] = lights if area < most or not lights > PARTLY else PARTLY
 
 
 @fused_part

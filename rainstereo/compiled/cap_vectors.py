@@ -5,10 +5,11 @@ They are written for that compiler in LLVM's own language, as in `eights`.
 
 from __future__ import annotations
 
+from platform import machine
 from typing import Any
 
 import numpy as np
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from .boxes import BITS
@@ -16,6 +17,7 @@ from .compile import fused_part
 from .llvm import FOUR, LONG, REAL, alike, arguments, ir, load, spread, store
 
 WIDE = 8
+get_or_insert_function: Any = vars(cgutils)["get_or_insert_function"]
 WORDS, REALS = ir.VectorType(FOUR, WIDE), ir.VectorType(REAL, WIDE)
 FIELD = (1 << BITS) - 1
 ALL_LANES = 64
@@ -33,6 +35,19 @@ def gathered(builder: Any, words: Any, numbers: Any, first: Any) -> Any:
         word = builder.load(builder.gep(words, [builder.zext(number, LONG)]))
         found = builder.insert_element(found, word, FOUR(lane))
     return found
+
+
+def pairs_times(builder: Any, one: Any, other: Any) -> Any:
+    """Eight numbers of 16 bits times others, and each two products that are side by side added, as four of 32 bits."""
+    whole, half = ir.VectorType(FOUR, 4), one.type
+    if machine().lower() in ("x86_64", "amd64"):
+        kind = ir.FunctionType(whole, [half, half])
+        return builder.call(get_or_insert_function(builder.module, kind, "llvm.x86.sse2.pmadd.wd"), [one, other])
+    products = builder.mul(*(builder.sext(each, ir.VectorType(FOUR, WIDE)) for each in (one, other)))
+    parts = (
+        builder.shuffle_vector(products, products, ir.Constant(whole, list(range(first, WIDE, 2)))) for first in (0, 1)
+    )
+    return builder.add(*parts)
 
 
 def folded(builder: Any, values: Any, add: Any, lanes: int) -> Any:

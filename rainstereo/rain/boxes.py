@@ -1,7 +1,7 @@
 """An image's means over boxes that overlap: what moving drops look at (`compiled.boxes`).
 
-There are two sizes to an octave, some eight boxes of the larger ones beside one another sharing each pixel, so that a
-place is never far from the middle of one: then a look is one number read, not four and their weights.
+There are two sizes to an octave, and some four to eight boxes of all but the smallest beside one another share each
+pixel: so a weighted mean of the four about a place is nearly a box there, and one ray of many may look at the nearest.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from rainstereo.types import Array, Image
 
 from .pyramid import half
 
-SECOND = 2  # pixels between the boxes of up to `DENSE` pixels
-DENSE = 16
-LARGEST = 1024
+SECOND = 2  # pixels between the boxes of up to 8 pixels
+ALWAYS, LARGEST = 16, 1024
+"""Pixels: sizes up to which there are of every image; and of the largest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,9 @@ class Boxes:
     @cache
     def of(cls, size: tuple[int, int]) -> Boxes:
         """The boxes of an image of a size, (width, height)."""
-        steps, side = [SECOND], 8
-        while side <= DENSE or (side < 2 * max(size) and side <= LARGEST):
-            steps += [max(SECOND, side * SECOND // DENSE)] * 2
-            side *= 2
+        sides = [side for side in (8 << k for k in range(LARGEST.bit_length())) if side <= LARGEST]
+        count = 1 + 2 * sum(side <= ALWAYS or side < 2 * max(size) for side in sides)
+        steps = [SECOND << max((k - 3) // 2, (k + 1) // 4) for k in range(count)]  # loops know that, too
         shapes = [[-(-n // step) + 1 for n in size] for step in steps]
         start = np.cumsum([0, *(w * h for w, h in shapes)])
         width = np.array([w for w, _ in shapes], dtype=np.int64)
@@ -63,7 +62,8 @@ class Boxes:
         """All boxes of bytes, (H, W, 1 or 3), as (count,) uint32; copy: contiguous, gets a copy of the image."""
         from rainstereo.compiled.boxes import every_box
 
-        found = np.empty(self.count, dtype=np.uint32)
+        beyond = int(self.width[-1]) + 2  # that a look beside the last box reads, with weights of 0
+        found = np.empty(self.count + beyond, dtype=np.uint32)[: self.count]
         out = np.empty(0, dtype=np.uint8) if copy is None else copy.reshape(-1)
         every_box(image, out, found, self.start, self.width, self._steps)
         return found

@@ -34,13 +34,10 @@ from .outlines import BETWEEN, MARGIN, RING
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE = (20.0, 8), (math.inf, 25)
-COARSE = (16.0, 4), (math.inf, 6)
-"""Square root of the area, pixels, up to which what a pixel shows gets how many looks, the first of them at four boxes
-each."""
+FINE = (45.0, 9), (math.inf, 12)
+COARSE = (36.0, 4), (math.inf, 6)
+"""Square root of the area, pixels, up to which what a pixel shows gets how many looks."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
-WIDER = 1.4, 1.25
-"""Area of a box over that of its part of what a pixel shows: a little overlap is best."""
 FEW = 1500  # caps, up to which all pairs are compared
 
 
@@ -148,10 +145,7 @@ class CapScene:
     @cached_property
     def bands(self) -> Array:
         """How many looks a patch gets, by its area: see `compiled.cap_tiles`."""
-        rows = [
-            (min(side * side, FAR), aim, wider / aim) for (side, aim), wider in zip(self.fineness, WIDER, strict=True)
-        ]
-        return np.array(rows, dtype=np.float32)
+        return np.array([(min(side * side, FAR), aim) for side, aim in self.fineness], dtype=np.float32)
 
     def go(self, mode: int, out: Any, scene: Any, words: Any, caps: CapTable, record: Any) -> None:
         """Run the loops over caps, see `compiled.cap_frames.frame`."""

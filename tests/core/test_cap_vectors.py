@@ -39,17 +39,50 @@ def test_weighted_sums_are_those_of_channels():
 
 
 @needs_numba
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+def test_pairs_of_products(machine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the instruction that some processors have for it, and without."""
+    import numba
+    from numba.core import types
+    from numba.extending import intrinsic
+
+    from rainstereo.compiled import cap_vectors
+    from rainstereo.compiled.llvm import LONG, TWO, arguments, ir, load, store
+
+    monkeypatch.setattr(cap_vectors, "machine", lambda: machine)
+
+    @intrinsic
+    def step(_context, one, other, found):
+        def code(context, builder, signature, given):
+            *both, to = arguments(context, builder, signature, given)
+            eight = (load(builder, each, LONG(0), ir.VectorType(TWO, 8)) for each in both)
+            store(builder, cap_vectors.pairs_times(builder, *eight), to, LONG(0))
+            return context.get_dummy_value()
+
+        return types.void(one, other, found), code
+
+    @numba.njit
+    def pairs(one, other, found):
+        step(one, other, found)
+
+    one, other = np.random.default_rng(3).integers(-(1 << 15), 1 << 15, (2, 8)).astype(np.int16)
+    found = np.zeros(4, dtype=np.int32)
+    pairs(one, other, found)
+    np.testing.assert_array_equal(found, (one.astype(np.int64) * other).reshape(4, 2).sum(1))
+
+
+@needs_numba
 @pytest.mark.parametrize("border", ["mirror", "edge"])
 @pytest.mark.parametrize("first", [0, 3, 41])
 def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
-    """Eight pixels side by side against each by itself: grids of looks at the nearest box, or at four, in numpy."""
+    """Eight pixels side by side against each by itself: grids of looks between four boxes, in numpy."""
     from rainstereo.compiled import cap_patches, cap_rays, cap_tiles
     from rainstereo.compiled.cap_looks import BIAS
     from rainstereo.compiled.compile import fused_part
 
     @fused_part
-    def shown(border, every, fine, words, starts, last, bands, rays, boxes, parts):
-        cap_patches.show_whole(every, fine, words, starts, last, border, bands, rays, boxes, parts)
+    def shown(border, every, words, starts, last, rays, boxes, parts):
+        cap_patches.show_whole(every, words, starts, last, border, rays, boxes, parts)
 
     rng, size, count = np.random.default_rng(first), (317, 203), 13
     image = cv2.GaussianBlur(rng.integers(0, 256, (*size[::-1], 3)).astype(np.uint8), (0, 0), 4)
@@ -58,11 +91,10 @@ def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
     words = boxes.words(image)
     rays = np.full((cap_rays.PLANES, 64), np.nan, dtype=np.float32)  # of pixels that are no patches
     chosen = first + np.flatnonzero(rng.uniform(size=count) < 0.7)
-    fine = rng.uniform(size=64) < 0.4
-    every, small = (sum(1 << int(lane) for lane in lanes) for lanes in (chosen, chosen[fine[chosen]]))
+    every = sum(1 << int(lane) for lane in chosen)
     planes = {name: rays[int(getattr(cap_tiles, name)) // 64] for name in (
         "CX", "CY", "AX", "AY", "BX", "BY", "AXX", "AYY", "BXX", "BYY", "ABX", "ABY", "GAINS", "SIZE", "ACROSS",
-        "DOWN", "KIND", "FAR",
+        "DOWN", "FAR",
     )}  # fmt: skip
     for name, plane in planes.items():
         plane[chosen] = rng.uniform(-6, 6, len(chosen)) if len(name) == 3 else rng.uniform(-30, 30, len(chosen))
@@ -72,8 +104,7 @@ def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
     planes["GAINS"][chosen] = rng.uniform(0.2, 1, len(chosen))
     planes["SIZE"][chosen] = rng.integers(0, 7, len(chosen))
     planes["ACROSS"][chosen] = rng.integers(2, 6, len(chosen))
-    planes["DOWN"][chosen] = np.where(fine[chosen], 2, rng.integers(2, 6, len(chosen)))
-    planes["KIND"][chosen], planes["FAR"][chosen] = ~fine[chosen], np.where(far[chosen], -1, 1)
+    planes["DOWN"][chosen], planes["FAR"][chosen] = rng.integers(2, 6, len(chosen)), np.where(far[chosen], -1, 1)
     rays[int(cap_rays.HIDDEN) // 64, chosen] = rng.uniform(0.5, 1, len(chosen))
     expected = np.zeros((64, 3))
     values = np.stack([words >> np.uint32(8 * channel) & np.uint32(255) for channel in range(3)], -1) - float(BIAS)
@@ -90,25 +121,18 @@ def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
         k = int(p["SIZE"])
         step, some = 1 / float(boxes.inverse[k]), boxes.part(values, k)
         column, row = (x + 0.5) / step, (y + 0.5) / step  # box j lies about the edge before pixel `step` j
-        if fine[lane]:
-            u, v = (np.floor(4 * part + 0.5) / 4 for part in (column, row))
-            j, i = np.floor(u).astype(int), np.floor(v).astype(int)
-            u, v = (u - j)[:, None], (v - i)[:, None]
-            looks = (1 - v) * ((1 - u) * some[i, j] + u * some[i, j + 1])
-            looks += v * ((1 - u) * some[i + 1, j] + u * some[i + 1, j + 1])
-        else:
-            looks = some[np.floor(row + 0.5).astype(int), np.floor(column + 0.5).astype(int)]
+        u, v = (np.floor(8 * part + 0.5) / 8 for part in (column, row))
+        j, i = np.floor(u).astype(int), np.floor(v).astype(int)
+        u, v = (u - j)[:, None], (v - i)[:, None]
+        looks = (1 - v) * ((1 - u) * some[i, j] + u * some[i, j + 1])
+        looks += v * ((1 - u) * some[i + 1, j] + u * some[i + 1, j + 1])
         expected[lane] = p["GAINS"] * rays[int(cap_rays.HIDDEN) // 64, lane] * looks.mean(0)
     where = slice(int(cap_rays.SHOWN), int(cap_rays.SHOWN) + 192)
     flat = rays.ravel()
     flat[where] = 0
     places = np.zeros((2, cap_patches.PLACES), dtype=np.uint32)
-    bands = np.array([[400, 10, 1], [1e14, 25, 1]], dtype=np.float32)
     last = np.float32(size[0] - 1), np.float32(size[1] - 1)
-    shown(
-        0 if border == "mirror" else 1, np.uint64(every), np.uint64(small), words, boxes.start, last, bands, flat,
-        *places,
-    )  # fmt: skip
+    shown(0 if border == "mirror" else 1, np.uint64(every), words, boxes.start, last, flat, *places)
     found = flat[where].reshape(64, 3)
     off = np.abs(found - expected)
     assert expected.max() > 50
@@ -138,7 +162,7 @@ def test_what_is_beside_the_light_stays_dark():
         rays[first + 1, 3:8] = 100 + 9 * down
         rays[first + 2] = np.where((x > 2) & (x < 8), 0.9, 0)
     rays[int(cap_rays.OWN) // 64 + 2, 6:] = 0
-    bands = np.array([[64, 8, 1 / 8], [1e14, 25, 1 / 25]], dtype=np.float32)
+    bands = np.array([[64, 8], [1e14, 25]], dtype=np.float32)
     zero, last = np.float32(0), np.float32(1000)
     patches(rays.ravel(), 3, 6, bands, 12, (zero, zero), (last, last))
     np.testing.assert_array_equal(lights[:16], [0, 0, 0, 2, 2, 2, *[0] * 10])

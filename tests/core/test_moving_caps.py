@@ -325,8 +325,8 @@ def test_boxes_are_means(size, channels):
     assert np.abs(fields - numbers).max() <= 2
     if size == (64, 48):
         assert abs((fields - numbers).mean() - 0.125) < 0.1  # halves are rounded up once
-        assert [round(1 / float(inverse)) for inverse in boxes.inverse[:7]] == [2, 2, 2, 2, 2, 4, 4]
-        for k, step, side in ((0, 2, 4), (2, 2, 8), (4, 2, 16), (6, 4, 32)):
+        assert [round(1 / float(inverse)) for inverse in boxes.inverse[:9]] == [2, 2, 2, 4, 4, 4, 4, 8, 8]
+        for k, step, side in ((0, 2, 4), (2, 2, 8), (4, 4, 16), (6, 4, 32)):
             i, j = 32 // step, 24 // step
             part = image[24 - side // 2 : 24 + side // 2, 32 - side // 2 : 32 + side // 2]
             np.testing.assert_allclose(boxes.part(numbers, k)[j, i], part.mean((0, 1)), atol=1e-3)
