@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .compile import compiled, fused
+from .compile import compiled, fused, inlined
 from .eights import copy_eight, four_channels, one_channel, three_channels, two_channels
 from .layout import LANES, PLACES
 from .quads import quad_of
@@ -53,19 +53,35 @@ def cut(counts: Any, taps: Any, places: Any, clear: Any, seen: Any, pieces: Any,
 
 
 @compiled
+def split(counts: Any, given: Any, clear: Any, largest: int, taps: Any) -> None:
+    """Write how many taps rows have, (M,), if none weighs more than so much; all else as in `interleave`."""
+    tap, limit = U(0), np.int64(largest)
+    for row in range(U(len(counts))):
+        made = (np.int64(clear[row]) + limit - 1) // limit
+        for each in range(tap, tap + U(counts[row])):
+            made += max((abs(np.int64(given[each])) + limit - 1) // limit, 1)
+        taps[row] = made
+        tap += U(counts[row])
+
+
+@compiled
 def interleave(
-    counts: Any, found: Any, given: Any, number: Any, clear: Any, below: int, most: Any, places: Any, weights: Any
+    counts: Any, found: Any, given: Any, number: Any, clear: Any, below: int, largest: int, most: Any, places: Any,
+    weights: Any,
 ) -> None:  # fmt: skip
     """Write the taps of eight rows, in turn, the first of each, the second of each, ...; weights of 0 fill up.
+
+    What weighs more than `largest`, up or down, becomes several taps of one place.
 
     counts: (M,), found, given: (T,) of rows, places in the row of texels, and weights. number: (n,) uint16, of pieces,
     the place of the first of the eight in the cell. clear: (M,) uint16, the weight of what is below, if not 0, whose
     places follow one another, the first being `below`. most: (ceil(M / 8),) the largest number of taps of eight rows, 1
-    at least, by which `places`, uint16, and `weights`, int16, are long. Rows that are missing to eight are as the last.
+    at least, by which `places`, uint16, and `weights`, int8 or int16, are long. Rows that are missing to eight are as
+    the last.
     """
     rows: Any = U(len(counts))
     tap, first, last = rows - rows, rows - rows, rows - rows
-    place: Any = np.uint16(below)
+    place, limit = U(below), np.int64(largest)
     places[:] = 0
     weights[:] = 0
     for eight in range(U(len(most))):
@@ -76,17 +92,27 @@ def interleave(
                     places[first + each * EIGHT + lane] = places[first + each * EIGHT + last]
                     weights[first + each * EIGHT + lane] = weights[first + each * EIGHT + last]
                 continue
-            last = lane
-            for each in range(U(counts[row])):
-                at = U(found[tap])
-                places[first + each * EIGHT + lane] = U(number[at // EIGHT]) + at % EIGHT
-                weights[first + each * EIGHT + lane] = given[tap]
-                tap += U(1)
+            last, to = lane, first + lane
+            for each in range(tap, tap + U(counts[row])):
+                at = U(found[each])
+                to = _put(places, weights, to, U(number[at // EIGHT]) + at % EIGHT, np.int64(given[each]), limit)
+            tap += U(counts[row])
             if clear[row]:
-                places[first + U(counts[row]) * EIGHT + lane] = place
-                weights[first + U(counts[row]) * EIGHT + lane] = np.int16(clear[row])
-                place += np.uint16(1)
+                _put(places, weights, to, place, np.int64(clear[row]), limit)
+                place += U(1)
         first += U(most[eight]) * EIGHT
+
+
+@inlined
+def _put(places: Any, weights: Any, to: Any, place: Any, weight: Any, limit: Any) -> Any:
+    """Write one place, as often as its weight takes; returns where the row's next tap goes."""
+    while True:
+        part = min(max(weight, -limit), limit)
+        places[to], weights[to] = place, part
+        weight -= part
+        to += EIGHT
+        if weight == 0:
+            return to
 
 
 @fused

@@ -17,8 +17,9 @@ from .llvm import BYTE, FOUR, LONG, TWO, alike, arguments, ir, load, spread, sto
 
 VECTOR, SHORTS = ir.VectorType(FOUR, LANES), ir.VectorType(TWO, LANES)
 LAST = 255
-AHEAD = 512
-"""Taps by which memory is asked for before it is needed: a frame's are too many for the caches, and are read once."""
+AHEAD = 1024
+"""Bytes by which memory is asked for before it is needed: a frame's taps are too many for the caches, and are read
+once."""
 
 
 def _summing(channels: int) -> Any:
@@ -52,8 +53,9 @@ def _write(
     builder.position_at_end(loop)  # one tap of each pixel: quads are fetched one by one, and weighted together
     tap, sums = builder.phi(LONG), [builder.phi(VECTOR) for _ in range(channels)]
     for table in (places, weights):
-        prefetch.call(builder, table, builder.add(tap, ir.Constant(LONG, AHEAD)))
-    factors = builder.sext(load(builder, weights, tap, SHORTS), VECTOR)
+        ahead = AHEAD * BYTE.width // table.type.pointee.width
+        prefetch.call(builder, table, builder.add(tap, ir.Constant(LONG, ahead)))
+    factors = builder.sext(load(builder, weights, tap, ir.VectorType(weights.type.pointee, LANES)), VECTOR)
     found = ir.Constant(VECTOR, ir.Undefined)
     for lane in range(LANES):
         place = builder.zext(builder.load(builder.gep(places, [builder.add(tap, ir.Constant(LONG, lane))])), LONG)
@@ -116,6 +118,6 @@ one_channel, two_channels, three_channels, four_channels = (_summing(channels) f
 to row + 7. later: eight rows whose pixels in `out` will be written soon: hints to fetch their memory.
 
 out: (P * 3,) uint8. quads: (N,) uint32. shift: uint32, bits of a weight's unit. pixels: (M,) uint32. places, weights:
-(T,) uint16, int16 of taps: those of the rows from the number `first` to before `end`, interleaved
+(T,) uint16, int8 or int16 of taps: those of the rows from the number `first` to before `end`, interleaved
 (`cells.interleave`). roundings: (M,) int16, to which sums are added.
 """

@@ -23,6 +23,8 @@ from .quadtree import UNIT
 
 SHIFT = UNIT.bit_length() - 1
 TOGETHER = 1 << 20  # taps whose rows are put in order at a time
+LARGEST, ANY, MORE = 127, 1 << 15, 1.08
+"""Weight of a tap in one byte, in two, and how many times the taps a cell may have if those that weigh more are split."""
 MOST = PLACES // LANES - 1  # taps of a row: one more for what is below
 BLOCK = 1 << 23  # numbers of 16 bits that are held in one piece of memory
 
@@ -144,15 +146,22 @@ class Cells:
 
     def _cell(self, rows: Any, places: Any, weights: Any, pieces: Any, number: Any, arena: Arena) -> Cell:
         """number: of all pieces, to work in."""
-        from rainstereo.compiled.cells import interleave
+        from rainstereo.compiled.cells import interleave, split
 
         counts, clear, pixels = self.counts[rows], self.clear[rows], self.pixels[rows]
         soft = clear > 0
         number[pieces] = LANES * np.arange(len(pieces))
-        most = np.maximum.reduceat(np.maximum(counts + soft, 1), np.arange(0, len(counts), LANES))
+        taps = np.empty_like(counts)
+        split(counts, weights, clear, LARGEST, taps)
+        most, of_bytes = (
+            np.maximum.reduceat(np.maximum(count, 1), np.arange(0, len(counts), LANES)) for count in (counts + soft, taps)
+        )
+        small = of_bytes.sum(dtype=np.int64) <= MORE * most.sum(dtype=np.int64)
+        most = of_bytes if small else most
+        largest, kind = (LARGEST, np.int8) if small else (ANY, np.int16)
         size = LANES * int(most.sum(dtype=np.int64))
-        made = arena.take(size), arena.take(size).view(np.int16)
-        interleave(counts, places, weights, number, clear, LANES * len(pieces), most, *made)
+        made = arena.take(size), arena.take(size * kind().itemsize // 2).view(kind)
+        interleave(counts, places, weights, number, clear, LANES * len(pieces), largest, most, *made)
         rest = (0, -len(rows) % LANES)
         return Cell(
             pieces, pixels[soft], np.pad(pixels, rest, mode="edge"), most.astype(np.uint32), *made,

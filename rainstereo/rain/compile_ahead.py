@@ -18,6 +18,7 @@ from rainstereo.chamber import Chamber, Panel
 from rainstereo.droplet import SphericalCap
 from rainstereo.types import Indices
 
+from .cells import LARGEST
 from .far_caps import FarCaps
 from .free_memory import give_back
 from .lookups import Lookups
@@ -73,12 +74,13 @@ def _draw() -> None:
     texels = np.append(np.arange(4), SIDE**2 + np.arange(12)).astype(
         np.int32
     )  # some pixels, and most of the next level
-    weights = np.full(len(texels), 64, dtype=np.int16)
     one: Indices = np.zeros(1, dtype=np.intp)
-    taps = Taps(texels, weights, one + len(texels), np.zeros(1))
-    table = Lookups.of(one, one, taps, np.zeros(1), np.zeros((1, 2)), np.zeros(1, dtype=np.bool_)).ordered(SIDE)
     image = np.zeros((SIDE, SIDE, 3), dtype=np.uint8)
-    for some in (table, table.narrow((SIDE, SIDE))[0]):
-        paste = Paste([some], (SIDE, SIDE), SIDE)
-        for _ in range(2):  # the second time, otherwise than the first
-            paste.paste(image, image, image.copy())
+    for weight in (LARGEST, LARGEST**2):  # in a byte, and in two
+        weights = np.full(len(texels), weight, dtype=np.int16)
+        taps = Taps(texels, weights, one + len(texels), np.zeros(1))
+        table = Lookups.of(one, one, taps, np.zeros(1), np.zeros((1, 2)), np.zeros(1, dtype=np.bool_)).ordered(SIDE)
+        for some in (table, table.narrow((SIDE, SIDE))[0]):
+            paste = Paste([some], (SIDE, SIDE), SIDE)
+            for _ in range(2):  # the second time, otherwise than the first
+                paste.paste(image, image, image.copy())

@@ -45,7 +45,7 @@ def test_sums_against_whole_numbers(rows, channels):
     number = np.zeros(60, dtype=np.uint16)
     number[pieces] = 8 * np.arange(len(pieces))
     found = 8 * pieces[of_tap // 8] + of_tap % 8
-    interleave(counts, found, weights, number, clear, len(values), most, places, factors)
+    interleave(counts, found, weights, number, clear, len(values), 1 << 15, most, places, factors)
     roundings = rng.integers(0, 1024, rows).astype(np.int16)
     full = np.minimum(np.arange(8 * groups), rows - 1)
     out, near = below.copy(), np.empty(PLACES, dtype=np.uint32)
