@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .compile import compiled, fused, inlined
+from .compile import compiled, fused
 from .eights import copy_eight, four_channels, one_channel, three_channels, two_channels
 from .layout import LANES, PLACES
 from .quads import quad_of
@@ -53,15 +53,42 @@ def cut(counts: Any, taps: Any, places: Any, clear: Any, seen: Any, pieces: Any,
 
 
 @compiled
-def split(counts: Any, given: Any, clear: Any, largest: int, taps: Any) -> None:
-    """Write how many taps rows have, (M,), if none weighs more than so much; all else as in `interleave`."""
-    tap, limit = U(0), np.int64(largest)
+def pair(
+    counts: Any, found: Any, given: Any, number: Any, largest: int, work: Any, pairs: Any, places: Any, weights: Any
+) -> None:  # fmt: skip
+    """Write rows anew, as pairs of places that follow one another in an eight, and their weights, each one byte.
+
+    counts, found, given, number: as in `interleave`. largest: what weighs more, up or down, is in several pairs. work:
+    (`PLACES`,) int32, of 0, and so again. pairs: (M,) of each row. places: (T + sum |given| / largest,) uint16, in the
+    cell, of the first of a pair, weights: int8, twice as long, and as interleaved.
+    """
+    tap, made, limit, none = U(0), U(0), np.int64(largest), np.int64(0)
     for row in range(U(len(counts))):
-        made = (np.int64(clear[row]) + limit - 1) // limit
-        for each in range(tap, tap + U(counts[row])):
-            made += max((abs(np.int64(given[each])) + limit - 1) // limit, 1)
-        taps[row] = made
-        tap += U(counts[row])
+        begun, end = made, tap + U(counts[row])
+        for each in range(tap, end):
+            at = U(found[each])
+            work[U(number[at // EIGHT]) + at % EIGHT] += given[each]
+        for each in range(tap, end):
+            start = U(number[U(found[each]) // EIGHT])
+            place, last = start, start + EIGHT - U(1)
+            while place <= last:
+                one, other = np.int64(work[place]), none
+                if one == 0:
+                    place += U(1)
+                    continue
+                work[place] = 0
+                if place < last:
+                    other = np.int64(work[place + U(1)])
+                    work[place + U(1)] = 0
+                while one != 0 or other != 0:
+                    part, beside = min(max(one, -limit), limit), min(max(other, -limit), limit)
+                    places[made], weights[U(2) * made], weights[U(2) * made + U(1)] = place, part, beside
+                    one -= part
+                    other -= beside
+                    made += U(1)
+                place += U(2)
+        tap = end
+        pairs[row] = made - begun
 
 
 @compiled
@@ -71,17 +98,15 @@ def interleave(
 ) -> None:  # fmt: skip
     """Write the taps of eight rows, in turn, the first of each, the second of each, ...; weights of 0 fill up.
 
-    What weighs more than `largest`, up or down, becomes several taps of one place.
-
     counts: (M,), found, given: (T,) of rows, places in the row of texels, and weights. number: (n,) uint16, of pieces,
     the place of the first of the eight in the cell. clear: (M,) uint16, the weight of what is below, if not 0, whose
-    places follow one another, the first being `below`. most: (ceil(M / 8),) the largest number of taps of eight rows, 1
-    at least, by which `places`, uint16, and `weights`, int8 or int16, are long. Rows that are missing to eight are as
+    places follow one another, the first being `below`; `largest` at most in a tap. most: (ceil(M / 8),) the largest number of taps of eight rows, 1
+    at least, by which `places`, uint16, and `weights`, int16, are long. Rows that are missing to eight are as
     the last.
     """
     rows: Any = U(len(counts))
     tap, first, last = rows - rows, rows - rows, rows - rows
-    place, limit = U(below), np.int64(largest)
+    place, limit = U(below) - U(1), np.int64(largest)
     places[:] = 0
     weights[:] = 0
     for eight in range(U(len(most))):
@@ -95,24 +120,16 @@ def interleave(
             last, to = lane, first + lane
             for each in range(tap, tap + U(counts[row])):
                 at = U(found[each])
-                to = _put(places, weights, to, U(number[at // EIGHT]) + at % EIGHT, np.int64(given[each]), limit)
+                places[to], weights[to] = U(number[at // EIGHT]) + at % EIGHT, given[each]
+                to += EIGHT
             tap += U(counts[row])
-            if clear[row]:
-                _put(places, weights, to, place, np.int64(clear[row]), limit)
-                place += U(1)
+            left = np.int64(clear[row])
+            place += U(left > 0)
+            while left > 0:
+                places[to], weights[to] = place, min(left, limit)
+                left -= limit
+                to += EIGHT
         first += U(most[eight]) * EIGHT
-
-
-@inlined
-def _put(places: Any, weights: Any, to: Any, place: Any, weight: Any, limit: Any) -> Any:
-    """Write one place, as often as its weight takes; returns where the row's next tap goes."""
-    while True:
-        part = min(max(weight, -limit), limit)
-        places[to], weights[to] = place, part
-        weight -= part
-        to += EIGHT
-        if weight == 0:
-            return to
 
 
 @fused

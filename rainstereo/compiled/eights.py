@@ -17,9 +17,11 @@ from .llvm import BYTE, FOUR, LONG, TWO, alike, arguments, ir, load, spread, sto
 
 VECTOR, SHORTS = ir.VectorType(FOUR, LANES), ir.VectorType(TWO, LANES)
 LAST = 255
-AHEAD = 1024
-"""Bytes by which memory is asked for before it is needed: a frame's taps are too many for the caches, and are read
-once."""
+PAIRS = ir.VectorType(FOUR, 2 * LANES)
+FIRSTS = ir.Constant(ir.VectorType(FOUR, 2 * LANES), [lane for own in range(LANES) for lane in (own, LANES)])
+EACH = [ir.Constant(VECTOR, list(range(first, 2 * LANES, 2))) for first in (0, 1)]
+AHEAD = 512
+"""Taps by which memory is asked for before it is needed: a frame's are too many for the caches, and are read once."""
 
 
 def _summing(channels: int) -> Any:
@@ -47,22 +49,27 @@ def _write(
     for lane in range(LANES):
         prefetch.call(builder, out, _first_byte(builder, channels, pixels, later, lane), 1)
     start = builder.sext(load(builder, roundings, row, SHORTS), VECTOR)
+    many, wide = (2, PAIRS) if weights.type.pointee == BYTE else (1, VECTOR)  # texels of a tap
+    if many == 2:
+        start = builder.shuffle_vector(start, alike(VECTOR, 0), FIRSTS)
     before, loop, after = builder.block, builder.append_basic_block("tap"), builder.append_basic_block("write")
     builder.branch(loop)
 
     builder.position_at_end(loop)  # one tap of each pixel: quads are fetched one by one, and weighted together
-    tap, sums = builder.phi(LONG), [builder.phi(VECTOR) for _ in range(channels)]
-    for table in (places, weights):
-        ahead = AHEAD * BYTE.width // table.type.pointee.width
-        prefetch.call(builder, table, builder.add(tap, ir.Constant(LONG, ahead)))
-    factors = builder.sext(load(builder, weights, tap, ir.VectorType(weights.type.pointee, LANES)), VECTOR)
-    found = ir.Constant(VECTOR, ir.Undefined)
+    tap, sums = builder.phi(LONG), [builder.phi(wide) for _ in range(channels)]
+    weight = builder.mul(tap, ir.Constant(LONG, many))
+    prefetch.call(builder, places, builder.add(tap, ir.Constant(LONG, AHEAD)))
+    prefetch.call(builder, weights, builder.add(weight, ir.Constant(LONG, many * AHEAD)))
+    factors = builder.sext(load(builder, weights, weight, ir.VectorType(weights.type.pointee, many * LANES)), wide)
+    element = ir.IntType(many * FOUR.width)
+    found = ir.Constant(ir.VectorType(element, LANES), ir.Undefined)
     for lane in range(LANES):
         place = builder.zext(builder.load(builder.gep(places, [builder.add(tap, ir.Constant(LONG, lane))])), LONG)
-        found = builder.insert_element(found, builder.load(builder.gep(quads, [place])), ir.Constant(FOUR, lane))
+        found = builder.insert_element(found, load(builder, quads, place, element), ir.Constant(FOUR, lane))
+    found = builder.bitcast(found, wide)
     added = []
     for channel, total in enumerate(sums):
-        values = builder.and_(builder.lshr(found, alike(VECTOR, 8 * channel)), alike(VECTOR, LAST))
+        values = builder.and_(builder.lshr(found, alike(wide, 8 * channel)), alike(wide, LAST))
         added.append(builder.add(total, builder.mul(values, factors)))
     following = builder.add(tap, ir.Constant(LONG, LANES))
     builder.cbranch(builder.icmp_unsigned("<", following, end), loop, after)
@@ -75,6 +82,8 @@ def _write(
     builder.position_at_end(after)  # whole gray levels from 0 to 255, side by side again
     shown, unit = alike(VECTOR, 0), spread(builder, shift, VECTOR)
     for channel, total in enumerate(added):
+        if many == 2:
+            total = builder.add(*(builder.shuffle_vector(total, total, each) for each in EACH))
         level = builder.ashr(total, unit)
         level = builder.select(builder.icmp_signed(">", level, alike(VECTOR, 0)), level, alike(VECTOR, 0))
         level = builder.select(builder.icmp_signed("<", level, alike(VECTOR, LAST)), level, alike(VECTOR, LAST))
@@ -118,6 +127,6 @@ one_channel, two_channels, three_channels, four_channels = (_summing(channels) f
 to row + 7. later: eight rows whose pixels in `out` will be written soon: hints to fetch their memory.
 
 out: (P * 3,) uint8. quads: (N,) uint32. shift: uint32, bits of a weight's unit. pixels: (M,) uint32. places, weights:
-(T,) uint16, int8 or int16 of taps: those of the rows from the number `first` to before `end`, interleaved
+(T,) uint16, int16, or (2 T,) int8, of a place and the one after it, of taps: those of the rows from the number `first` to before `end`, interleaved
 (`cells.interleave`). roundings: (M,) int16, to which sums are added.
 """

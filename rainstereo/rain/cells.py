@@ -23,8 +23,9 @@ from .quadtree import UNIT
 
 SHIFT = UNIT.bit_length() - 1
 TOGETHER = 1 << 20  # taps whose rows are put in order at a time
-LARGEST, ANY, MORE = 127, 1 << 15, 1.08
-"""Weight of a tap in one byte, in two, and how many times the taps a cell may have if those that weigh more are split."""
+LARGEST, ANY, FEWER = 127, 1 << 15, 0.8
+"""Weight of a tap in one byte, in two, and to which share of the taps pairs of neighbours in bytes are worth it."""
+EIGHTS: Any = np.arange(0, PLACES, LANES, dtype=np.uint16)
 MOST = PLACES // LANES - 1  # taps of a row: one more for what is below
 BLOCK = 1 << 23  # numbers of 16 bits that are held in one piece of memory
 
@@ -146,24 +147,43 @@ class Cells:
 
     def _cell(self, rows: Any, places: Any, weights: Any, pieces: Any, number: Any, arena: Arena) -> Cell:
         """number: of all pieces, to work in."""
-        from rainstereo.compiled.cells import interleave, split
+        from rainstereo.compiled.cells import interleave
 
-        counts, clear, pixels = self.counts[rows], self.clear[rows], self.pixels[rows]
-        soft = clear > 0
         number[pieces] = LANES * np.arange(len(pieces))
-        taps = np.empty_like(counts)
-        split(counts, weights, clear, LARGEST, taps)
-        most, of_bytes = (
-            np.maximum.reduceat(np.maximum(count, 1), np.arange(0, len(counts), LANES)) for count in (counts + soft, taps)
-        )
-        small = of_bytes.sum(dtype=np.int64) <= MORE * most.sum(dtype=np.int64)
-        most = of_bytes if small else most
-        largest, kind = (LARGEST, np.int8) if small else (ANY, np.int16)
-        size = LANES * int(most.sum(dtype=np.int64))
-        made = arena.take(size), arena.take(size * kind().itemsize // 2).view(kind)
+        clear, largest, kind = self.clear[rows], ANY, np.int16
+        counts, most = self.counts[rows], _most(self.counts[rows] + (clear > 0))
+        order, paired, *taps = _pairs(counts, places, weights, number, clear)
+        fewer = _most(paired + -(clear[order].astype(np.int64) // -LARGEST))
+        if fewer.sum() <= FEWER * most.sum():
+            rows, clear, largest, kind = rows[order], clear[order], LARGEST, np.int8
+            counts, (places, weights), number, most = paired, taps, EIGHTS, fewer
+        pixels, soft = self.pixels[rows], clear > 0
+        size = LANES * int(most.sum())
+        made = arena.take(size), arena.take(size).view(np.int16)
         interleave(counts, places, weights, number, clear, LANES * len(pieces), largest, most, *made)
         rest = (0, -len(rows) % LANES)
         return Cell(
-            pieces, pixels[soft], np.pad(pixels, rest, mode="edge"), most.astype(np.uint32), *made,
-            np.pad(self.roundings[rows], rest, mode="edge"),
+            pieces, pixels[soft], np.pad(pixels, rest, mode="edge"), most.astype(np.uint32), made[0],
+            made[1].view(kind), np.pad(self.roundings[rows], rest, mode="edge"),
         )  # fmt: skip
+
+
+def _most(counts: Any) -> Any:
+    """(ceil(M / 8),) int64, the largest count of eight rows, 1 at least."""
+    return np.maximum.reduceat(np.maximum(counts, 1), np.arange(0, len(counts), LANES)).astype(np.int64)
+
+
+def _pairs(counts: Any, places: Any, weights: Any, number: Any, clear: Any) -> tuple[Any, ...]:
+    """Rows as pairs of places: their order, those of as many pairs together, and in it their counts of pairs, places in
+    the cell and weights, two in one number."""
+    from rainstereo.compiled.cells import pair
+    from rainstereo.compiled.orders import reorder
+
+    room = len(places) + int(np.abs(weights, dtype=np.int32).sum()) // LARGEST
+    pairs, firsts, bytes_of = np.empty_like(counts), np.empty(room, np.uint16), np.empty(2 * room, np.int8)
+    pair(counts, places, weights, number, LARGEST, np.zeros(PLACES, np.int32), pairs, firsts, bytes_of)
+    order = np.argsort(pairs + -(clear.astype(np.int64) // -LARGEST), kind="stable")
+    taps = firsts, bytes_of.view(np.int16)
+    found = [np.empty_like(each[: pairs.sum()]) for each in taps]
+    reorder(order, np.cumsum(pairs, dtype=np.int64) - pairs, pairs, *taps, *found)
+    return order, pairs[order], *found
