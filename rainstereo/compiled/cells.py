@@ -100,9 +100,11 @@ def interleave(
 
     counts: (M,), found, given: (T,) of rows, places in the row of texels, and weights. number: (n,) uint16, of pieces,
     the place of the first of the eight in the cell. clear: (M,) uint16, the weight of what is below, if not 0, whose
-    places follow one another, the first being `below`; `largest` at most in a tap. most: (ceil(M / 8),) the largest number of taps of eight rows, 1
-    at least, by which `places`, uint16, and `weights`, int16, are long. Rows that are missing to eight are as
-    the last.
+    places follow one another, the first being `below`; `largest` at most in a tap. most: (ceil(M / 8),) the largest
+    number of taps of eight rows, 1 at least, by which `places`, uint16, and `weights`, int16, are long. Rows that are
+    missing to eight are as the last.
+
+    So are pairs (`pair`), whose weights, two bytes, are one number: it is that of the first if that of the second is 0.
     """
     rows: Any = U(len(counts))
     tap, first, last = rows - rows, rows - rows, rows - rows
@@ -140,10 +142,10 @@ def draw(
     """Write the pixels of a cell: sums of bytes times weights.
 
     out: (P * channels,) uint8, of one to four channels. row: (8 n,) uint32 quads of texels. below: (P, channels)
-    uint8. shift: bits of a weight's unit. near: (`PLACES`,) uint32, to work in. pieces: (n,) uint32 numbers of those of
-    the row that are copied there, one after the other. soft: (S,) uint32 pixels below that follow them.
-    pixels: (M,) uint32, M a multiple of 8. most, places, weights: of `interleave`. roundings: (M,) int16, units of
-    weights, for every channel.
+    uint8. shift: bits of a weight's unit. near: (`PLACES`,) uint32, to work in, and one more that is
+    read. pieces: (n,) uint32 numbers of those of the row that are copied there, one after the other. soft: (S,) uint32
+    pixels below that follow them. pixels: (M,) uint32, M a multiple of 8. most, places, weights: of `interleave`,
+    weights of pairs as int8. roundings: (M,) int16, units of weights, for every channel.
     """
     unit, tap, held, last = np.uint32(shift), U(0), U(0), U(len(most)) - U(1)
     for i in range(U(len(pieces))):

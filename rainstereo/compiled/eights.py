@@ -18,8 +18,9 @@ from .llvm import BYTE, FOUR, LONG, TWO, alike, arguments, ir, load, spread, sto
 VECTOR, SHORTS = ir.VectorType(FOUR, LANES), ir.VectorType(TWO, LANES)
 LAST = 255
 PAIRS = ir.VectorType(FOUR, 2 * LANES)
-FIRSTS = ir.Constant(ir.VectorType(FOUR, 2 * LANES), [lane for own in range(LANES) for lane in (own, LANES)])
+FIRSTS = ir.Constant(PAIRS, [lane for own in range(LANES) for lane in (own, LANES)])
 EACH = [ir.Constant(VECTOR, list(range(first, 2 * LANES, 2))) for first in (0, 1)]
+"""Numbers and zeros in turn, of vectors of both; every second number of a vector."""
 AHEAD = 512
 """Taps by which memory is asked for before it is needed: a frame's are too many for the caches, and are read once."""
 
@@ -81,9 +82,9 @@ def _write(
 
     builder.position_at_end(after)  # whole gray levels from 0 to 255, side by side again
     shown, unit = alike(VECTOR, 0), spread(builder, shift, VECTOR)
+    if many == 2:
+        added = [builder.add(*(builder.shuffle_vector(both, both, each) for each in EACH)) for both in added]
     for channel, total in enumerate(added):
-        if many == 2:
-            total = builder.add(*(builder.shuffle_vector(total, total, each) for each in EACH))
         level = builder.ashr(total, unit)
         level = builder.select(builder.icmp_signed(">", level, alike(VECTOR, 0)), level, alike(VECTOR, 0))
         level = builder.select(builder.icmp_signed("<", level, alike(VECTOR, LAST)), level, alike(VECTOR, LAST))
@@ -127,6 +128,6 @@ one_channel, two_channels, three_channels, four_channels = (_summing(channels) f
 to row + 7. later: eight rows whose pixels in `out` will be written soon: hints to fetch their memory.
 
 out: (P * 3,) uint8. quads: (N,) uint32. shift: uint32, bits of a weight's unit. pixels: (M,) uint32. places, weights:
-(T,) uint16, int16, or (2 T,) int8, of a place and the one after it, of taps: those of the rows from the number `first` to before `end`, interleaved
-(`cells.interleave`). roundings: (M,) int16, to which sums are added.
+(T,) uint16, int16 of taps: those of the rows from the number `first` to before `end`, interleaved (`cells.interleave`);
+or weights (2 T,) int8, of a place and of the one after it. roundings: (M,) int16, to which sums are added.
 """

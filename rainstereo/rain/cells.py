@@ -4,6 +4,9 @@ A frame's texels are too many for the nearest caches, and lie on too many pages 
 side by side, in pieces of eight, before its rows are summed (`compiled.cells`): places among them take 16 bits. Cells
 are filled from all tables together, tile by tile. What is copied, some texels more than once, is a small part of what
 is looked at.
+
+Most taps of rows that have many are neighbours of another, and weigh little. Cells of such rows hold pairs of places,
+weights in bytes: one step of the loop for two taps, in the memory of one. What weighs more is split into several.
 """
 
 from __future__ import annotations
@@ -23,8 +26,9 @@ from .quadtree import UNIT
 
 SHIFT = UNIT.bit_length() - 1
 TOGETHER = 1 << 20  # taps whose rows are put in order at a time
-LARGEST, ANY, FEWER = 127, 1 << 15, 0.8
-"""Weight of a tap in one byte, in two, and to which share of the taps pairs of neighbours in bytes are worth it."""
+LARGEST, ANY = 127, 1 << 15  # that a tap weighs in one byte, in two
+LIGHT, FEWER = 0.5, 0.8
+"""Share of `LARGEST` that taps weigh in the mean, and share of their number that pairs are, up to which these pay."""
 EIGHTS: Any = np.arange(0, PLACES, LANES, dtype=np.uint16)
 MOST = PLACES // LANES - 1  # taps of a row: one more for what is below
 BLOCK = 1 << 23  # numbers of 16 bits that are held in one piece of memory
@@ -150,13 +154,15 @@ class Cells:
         from rainstereo.compiled.cells import interleave
 
         number[pieces] = LANES * np.arange(len(pieces))
-        clear, largest, kind = self.clear[rows], ANY, np.int16
+        clear, largest = self.clear[rows], ANY
+        kind: Any = np.int16
         counts, most = self.counts[rows], _most(self.counts[rows] + (clear > 0))
-        order, paired, *taps = _pairs(counts, places, weights, number, clear)
-        fewer = _most(paired + -(clear[order].astype(np.int64) // -LARGEST))
-        if fewer.sum() <= FEWER * most.sum():
-            rows, clear, largest, kind = rows[order], clear[order], LARGEST, np.int8
-            counts, (places, weights), number, most = paired, taps, EIGHTS, fewer
+        if np.abs(weights, dtype=np.int32).sum() <= LIGHT * LARGEST * len(weights):
+            order, paired, *taps = _pairs(counts, places, weights, number, clear)
+            fewer = _most(paired + _parts(clear[order]))
+            if fewer.sum() <= FEWER * most.sum():
+                rows, clear, largest, kind = rows[order], clear[order], LARGEST, np.int8
+                counts, (places, weights), number, most = paired, taps, EIGHTS, fewer
         pixels, soft = self.pixels[rows], clear > 0
         size = LANES * int(most.sum())
         made = arena.take(size), arena.take(size).view(np.int16)
@@ -173,6 +179,11 @@ def _most(counts: Any) -> Any:
     return np.maximum.reduceat(np.maximum(counts, 1), np.arange(0, len(counts), LANES)).astype(np.int64)
 
 
+def _parts(clear: Any) -> Any:
+    """(M,) int64 of taps that weigh so much together, (M,)."""
+    return -(clear.astype(np.int64) // -LARGEST)
+
+
 def _pairs(counts: Any, places: Any, weights: Any, number: Any, clear: Any) -> tuple[Any, ...]:
     """Rows as pairs of places: their order, those of as many pairs together, and in it their counts of pairs, places in
     the cell and weights, two in one number."""
@@ -182,7 +193,7 @@ def _pairs(counts: Any, places: Any, weights: Any, number: Any, clear: Any) -> t
     room = len(places) + int(np.abs(weights, dtype=np.int32).sum()) // LARGEST
     pairs, firsts, bytes_of = np.empty_like(counts), np.empty(room, np.uint16), np.empty(2 * room, np.int8)
     pair(counts, places, weights, number, LARGEST, np.zeros(PLACES, np.int32), pairs, firsts, bytes_of)
-    order = np.argsort(pairs + -(clear.astype(np.int64) // -LARGEST), kind="stable")
+    order = np.argsort(pairs + _parts(clear), kind="stable")
     taps = firsts, bytes_of.view(np.int16)
     found = [np.empty_like(each[: pairs.sum()]) for each in taps]
     reorder(order, np.cumsum(pairs, dtype=np.int64) - pairs, pairs, *taps, *found)

@@ -32,7 +32,7 @@ from .words import clip, packed, unpack
 
 HELD, SMALL = 108, 1 << 20
 """Bytes for each pixel of an image, but for so many at least, that taps may take, in tables and ready for the loop."""
-READY = 4  # bytes of a tap that is ready for the loop
+READY = 4  # bytes of a tap that is ready for the loop; of two, where they are a pair
 MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
 ROWS = 1 << 14  # that are summed at a time: few enough for the caches
 DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black

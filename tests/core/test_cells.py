@@ -10,6 +10,7 @@ pytest.importorskip("numba", reason="numba is not installed (extra fast)")
 from rainstereo import compiled
 from rainstereo.compiled.cells import cut
 from rainstereo.compiled.layout import PLACES
+from rainstereo.rain import cells
 from rainstereo.rain.cells import MOST
 from rainstereo.rain.lookups import Lookups
 from rainstereo.rain.paste import Paste
@@ -26,8 +27,12 @@ def rows_of(rng: np.random.Generator, rows: int, most: int) -> tuple[np.ndarray,
     return counts, texels, np.where(rng.random(rows) < 0.3, rng.integers(1, UNIT // 2, rows), 0).astype(np.uint16)
 
 
-def table(rng: np.random.Generator, pixels: np.ndarray, most: int) -> Lookups:
+def table(rng: np.random.Generator, pixels: np.ndarray, most: int, beside: bool = False) -> Lookups:
+    """beside: texels of a row follow one another."""
     counts, texels, clear = rows_of(rng, len(pixels), most)
+    if beside:
+        first = np.repeat(np.cumsum(counts) - counts, counts)
+        texels = (texels[first] + np.arange(len(texels)) - first).astype(np.int32) % copy_starts(SIZE)[-1]
     weights = rng.integers(-10, 20, len(texels)).astype(np.int16)
     away = rng.uniform(-200, 700, (len(pixels), 2)).astype(np.float32)
     away[counts == 0] = np.nan
@@ -58,6 +63,34 @@ def test_cells_hold_as_many_rows_as_there_is_room_for(rows, most):
         assert needed(first, last) <= PLACES
         assert last == rows or needed(first, last + 1) > PLACES
     assert len(found) > 3 or rows == 1 or most == 0
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize("share", [0.0, 0.01, 1.0])
+def test_pairs_of_neighbours(share, channels, monkeypatch):
+    """Weights in bytes, of both signs, the larger ones split; single taps in 16 bits where too many are large."""
+    rng = np.random.default_rng(5)
+    one = table(rng, rng.permutation(FRAME[0] * FRAME[1])[:4000], 40, beside=True)
+    assert (one.clear > 0).mean() > 0.1
+    some = rng.random(len(one.weights)) < share
+    one.weights[some] = rng.integers(-60, 200 if share == 1 else 1000, np.count_nonzero(some))
+    scene = rng.integers(0, 64, (*SIZE[::-1], channels), dtype=np.uint8)  # dark: words hold sums up to 383
+    below = rng.integers(0, 64, (*FRAME[::-1], channels), dtype=np.uint8)
+    found = []
+    for light in (0.5, 0):
+        monkeypatch.setattr(cells, "LIGHT", light)
+        paste, ours = Paste([one], SIZE, FRAME[0]), below.copy()
+        for _ in range(2):
+            paste.paste(scene, below, ours)
+        kinds = {cell.weights.dtype.itemsize for cell in paste._kept if cell.weights.any()}
+        assert kinds == {1 if light and share < 1 else 2}
+        found.append((ours, sum(len(cell.places) for cell in paste._kept)))
+    (ours, few), (plain, many) = found
+    assert few < 0.8 * many or share == 1
+    np.testing.assert_array_equal(ours, plain)
+    monkeypatch.setattr(compiled, "available", lambda: False)
+    paste.paste(scene, below, plain)
+    np.testing.assert_array_equal(ours, plain)
 
 
 @pytest.mark.parametrize("ordered", [False, True])

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("numba", reason="numba is not installed (extra fast)")
 
 from rainstereo.compiled import quads
-from rainstereo.compiled.cells import draw, interleave
+from rainstereo.compiled.cells import draw, interleave, pair
 from rainstereo.compiled.layout import COLUMNS, PLACES, QUARTERS, ROWS
 from rainstereo.rain.pyramid import half
 
@@ -25,7 +25,8 @@ def table(rng: np.random.Generator, rows: int, texels: int) -> tuple[np.ndarray,
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 @pytest.mark.parametrize("rows", [1, 7, 8, 203])
-def test_sums_against_whole_numbers(rows, channels):
+@pytest.mark.parametrize("largest", [1 << 15, 127], ids=["single", "paired"])
+def test_sums_against_whole_numbers(largest, rows, channels):
     """Texels are those of some pieces of a row, in another order, and after them what is below."""
     rng = np.random.default_rng(rows + channels)
     texels, pixels = 300, rng.permutation(500)[:rows]
@@ -38,14 +39,24 @@ def test_sums_against_whole_numbers(rows, channels):
     held = np.empty(len(values), dtype=np.uint32)
     quads.pack(values, held)
     row.reshape(-1, 8)[pieces] = held.reshape(-1, 8)
-    groups = -(-rows // 8)
-    most = np.zeros(groups, dtype=np.uint32)
-    np.maximum.at(most, np.arange(rows) // 8, np.maximum(counts + (clear > 0), 1).astype(np.uint32))
-    places, factors = (np.empty(8 * int(most.sum()), dtype=kind) for kind in (np.uint16, np.int16))
     number = np.zeros(60, dtype=np.uint16)
     number[pieces] = 8 * np.arange(len(pieces))
     found = 8 * pieces[of_tap // 8] + of_tap % 8
-    interleave(counts, found, weights, number, clear, len(values), 1 << 15, most, places, factors)
+    given = counts, found, weights, number
+    if largest == 127:
+        room = len(found) + int(np.abs(weights.astype(int)).sum()) // largest
+        pairs, firsts, both = np.empty_like(counts), np.empty(room, np.uint16), np.empty(2 * room, np.int8)
+        work = np.zeros(PLACES, dtype=np.int32)
+        pair(*given, largest, work, pairs, firsts, both)
+        assert not work.any()
+        given = pairs, firsts, both.view(np.int16), np.arange(0, PLACES, 8, dtype=np.uint16)
+    groups = -(-rows // 8)
+    most = np.zeros(groups, dtype=np.uint32)
+    made = given[0] - (clear.astype(int) // -largest)
+    np.maximum.at(most, np.arange(rows) // 8, np.maximum(made, 1).astype(np.uint32))
+    places, factors = (np.empty(8 * int(most.sum()), dtype=kind) for kind in (np.uint16, np.int16))
+    interleave(*given, clear, len(values), largest, most, places, factors)
+    factors = factors.view(np.int8) if largest == 127 else factors
     roundings = rng.integers(0, 1024, rows).astype(np.int16)
     full = np.minimum(np.arange(8 * groups), rows - 1)
     out, near = below.copy(), np.empty(PLACES, dtype=np.uint32)
