@@ -157,7 +157,8 @@ class Cells:
         clear, largest = self.clear[rows], ANY
         kind: Any = np.int16
         counts, most = self.counts[rows], _most(self.counts[rows] + (clear > 0))
-        if np.abs(weights, dtype=np.int32).sum() <= LIGHT * LARGEST * len(weights):
+        some = np.abs(weights[::LANES], dtype=np.int32)  # enough to tell
+        if some.sum() <= LIGHT * LARGEST * len(some):
             order, paired, *taps = _pairs(counts, places, weights, number, clear)
             fewer = _most(paired + _parts(clear[order]))
             if fewer.sum() <= FEWER * most.sum():
