@@ -67,7 +67,8 @@ def frame(
     """Go over the pixels of caps, in the order of the caps.
 
     mode: DRAW: into `out`, (H W C,) of up to three channels of bytes, which holds the clear image, from boxes of the
-    scene in `words`. COUNT: how many pixels and taps there are, to record's counters. FILL: write them to record.
+    scene in `words`. COUNT: how many pixels and taps there are, to record's counters. FILL: write them to record, taps
+    only if it has room for any.
     scene: (h, w, C) bytes; only its size matters unless drawing. boxes: starts, widths, inverse distances (`boxes`).
     border, shift: how the scene goes on, and where the frame is in it. bands: of patches' areas (`cap_tiles`).
     nodes, caps, ...: see `cap_rays`, `cap_tiles`.
@@ -184,7 +185,7 @@ def record_row(
         mean[:] = ZERO
         if begin <= lane < end and is_whole(rays, j) and not tiny:
             record_whole(
-                starts, pitches, inverses, size, border, rays, lane, boxes, texels, weights, cursor, filling,
+                starts, pitches, inverses, size, border, rays, lane, boxes, texels, weights, cursor,
             )  # fmt: skip
             bend = np.float32(1 / 24)
             mean[0] = rays[CX + j] - shift[0] + (rays[AXX + j] + rays[BXX + j]) * bend
@@ -199,7 +200,7 @@ def record_row(
             off = add_places(rays, shift, last, mean)
             boxes_of_rays(outlines[number], last, shift, border, len(starts), rays, RAYS, at)
             keep_to_boxes(at, RAYS)
-            record_rays(starts, size, rays, at, boxes, texels, weights, cursor, filling)
+            record_rays(starts, size, rays, at, boxes, texels, weights, cursor)
         elif low <= lane < high and has_own(rays, lane, tiny):
             rival, hidden = np.int64(rays[RIVAL + j]) - 1, ZERO
             near = bool(rival >= 0 or not rays[ROOM + j] > edge)
@@ -213,7 +214,7 @@ def record_row(
                     trace_own(caps[which], later, view, rays, RAYS)
                     off |= add_places(rays, shift, last, mean)
                     boxes_of_rays(outlines[which], last, shift, border, len(starts), rays, RAYS, at)
-                    record_rays(starts, size, rays, at, boxes, texels, weights, cursor, filling)
+                    record_rays(starts, size, rays, at, boxes, texels, weights, cursor)
             rays[HIDDEN + j] = max(hidden, rays[HIDDEN + j]) if hangs and not tiny else min(hidden, ONE)
         if not rays[HIDDEN + j] > ZERO:
             cursor[TAPS] = before

@@ -16,8 +16,9 @@ PIXELS, TAPS = 0, 1  # counters
 
 
 @fused_part
-def _tap(texels: Any, weights: Any, cursor: Any, filling: bool, texel: Any, weight: Any) -> None:
-    if filling:
+def _tap(texels: Any, weights: Any, cursor: Any, texel: Any, weight: Any) -> None:
+    """Count a tap, and write it down if there is room for taps at all."""
+    if len(texels) > 0:
         texels[cursor[TAPS]] = texel
         weights[cursor[TAPS]] = weight
     cursor[TAPS] += 1
@@ -25,7 +26,7 @@ def _tap(texels: Any, weights: Any, cursor: Any, filling: bool, texel: Any, weig
 
 @fused_part
 def _bilinear(
-    texels: Any, weights: Any, cursor: Any, filling: bool, first: Any, size: Any, x: Any, y: Any,
+    texels: Any, weights: Any, cursor: Any, first: Any, size: Any, x: Any, y: Any,
     weight: Any,
 ) -> None:  # fmt: skip
     """The four pixels about a place in the image, whose pixels are numbered from `first` on."""
@@ -34,13 +35,13 @@ def _bilinear(
     lower, right = min(i + 1, size[1] - 1), min(j + 1, size[0] - 1)
     for row, a in ((i, ONE - v), (lower, v)):
         for column, b in ((j, ONE - u), (right, u)):
-            _tap(texels, weights, cursor, filling, first + row * size[0] + column, weight * a * b)
+            _tap(texels, weights, cursor, first + row * size[0] + column, weight * a * b)
 
 
 @fused
 def record_whole(
     starts: Any, pitches: Any, inverses: Any, size: Any, border: Any, rays: Any, lane: Any, first: Any, texels: Any,
-    weights: Any, cursor: Any, filling: bool,
+    weights: Any, cursor: Any,
 ) -> None:  # fmt: skip
     """The taps of a pixel all of whose rays are lit. first: number of the image's first pixel among the texels."""
     j = np.uint64(lane)
@@ -51,7 +52,7 @@ def record_whole(
         for b in range(down):
             for a in range(across):
                 x, y = look_at(rays, j, a, b, across, down, last, border)
-                _bilinear(texels, weights, cursor, filling, first, size, x, y, gain / np.float32(across * down))
+                _bilinear(texels, weights, cursor, first, size, x, y, gain / np.float32(across * down))
         return
     k = np.uint64(np.int64(rays[SIZE + j]))
     start, pitch, inverse = starts[k], pitches[k], inverses[k]
@@ -59,15 +60,15 @@ def record_whole(
     for b in range(np.int64(rays[DOWN + j])):
         for a in range(np.int64(rays[ACROSS + j])):
             box, u, v = look_at_box(start, pitch, inverse, last, on, rays, j, a, b)
-            _tap(texels, weights, cursor, filling, box, part * (ONE - v) * (ONE - u))
-            _tap(texels, weights, cursor, filling, box + 1, part * (ONE - v) * u)
-            _tap(texels, weights, cursor, filling, box + pitch, part * v * (ONE - u))
-            _tap(texels, weights, cursor, filling, box + pitch + 1, part * v * u)
+            _tap(texels, weights, cursor, box, part * (ONE - v) * (ONE - u))
+            _tap(texels, weights, cursor, box + 1, part * (ONE - v) * u)
+            _tap(texels, weights, cursor, box + pitch, part * v * (ONE - u))
+            _tap(texels, weights, cursor, box + pitch + 1, part * v * u)
 
 
 @fused
 def record_rays(
-    starts: Any, size: Any, rays: Any, at: Any, first: Any, texels: Any, weights: Any, cursor: Any, filling: bool,
+    starts: Any, size: Any, rays: Any, at: Any, first: Any, texels: Any, weights: Any, cursor: Any,
 ) -> None:  # fmt: skip
     """The taps of a pixel with rays of its own, see `cap_edges.boxes_of_rays`."""
     for j in range(LANES):
@@ -75,9 +76,9 @@ def record_rays(
         if not weight > ZERO:
             continue
         if at[j] >> SIZE_SHIFT == NO_SIZE:
-            _bilinear(texels, weights, cursor, filling, first, size, rays[SUB + j], rays[SUB + Y_ + j], weight)
+            _bilinear(texels, weights, cursor, first, size, rays[SUB + j], rays[SUB + Y_ + j], weight)
         else:
-            _tap(texels, weights, cursor, filling, np.int64(box_of(at[j], starts)), weight)
+            _tap(texels, weights, cursor, np.int64(box_of(at[j], starts)), weight)
 
 
 @fused_part

@@ -1,4 +1,4 @@
-"""Loops compiled before a large plan needs memory, the first time by another process.
+"""Loops compiled before a large plan, or a frame of many moving drops, needs memory, the first time by another process.
 
 The compiler takes 100 MB and more, and never gives them back; machine code that is read from disk takes next to none.
 """
@@ -9,6 +9,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -26,6 +27,8 @@ from .paste import Paste
 from .pursuit import Pursuit
 from .quadtree import Quadtree, Taps
 
+Way = Literal["default", "lasting", "moving"]
+MANY = 1 << 17  # pixels of a plan, or of moving drops, whose loops are compiled before tables take memory
 SIDE = 8  # pixels
 SPAN = 40  # of the rays of a pixel
 PATIENCE = 600.0  # seconds for another process; then this one compiles
@@ -33,38 +36,45 @@ CHILD = """
 import sys
 sys.path[:] = {path!r}
 from rainstereo.rain import compile_ahead
-compile_ahead.compile_here({lasting})
+compile_ahead.compile_here({way!r})
 """
 
 
 @cache
-def compile_ahead(lasting: bool) -> None:
-    """Have the loops ready that plans and frames of drops at rest need; nothing without numba."""
+def compile_ahead(way: Way) -> None:
+    """Have the loops ready that plans and frames of drops need; nothing without numba."""
     if not compiled.available():
         return
     from rainstereo.compiled.compile import folder
 
-    done = folder() / f"rain-ahead-{'lasting' if lasting else 'default'}"
+    done = folder() / f"rain-ahead-{way}"
     if not done.exists() and Path(sys.executable or "").name.startswith("python"):  # not what else Python is built into
-        told = CHILD.format(path=sys.path, lasting=lasting)
+        told = CHILD.format(path=sys.path, way=way)
         try:
             subprocess.run([sys.executable, "-c", told], capture_output=True, timeout=PATIENCE, check=True)
             done.touch()
         except (OSError, ValueError, TypeError, subprocess.SubprocessError):
             pass  # nowhere to keep it, or no Python to start: this process compiles
-    compile_here(lasting)
+    compile_here(way)
 
 
-def compile_here(lasting: bool) -> None:
-    """Trace a pixel, find the taps of one, order, pack and draw them."""
+def compile_here(way: Way) -> None:
+    """Trace a pixel, find the taps of one, order, pack and draw them; or draw a moving drop, and tell its pixels."""
     camera, pane = Camera.pinhole(SPAN, SPAN, 0, 0, SIDE, SIDE), Chamber((0, 0, 1), 0.05, (Panel(0.002, 1.5),))
-    caps = FarCaps.of([SphericalCap((0, 0), 0.001, 0.5)], camera, pane, np.inf)
+    cap = SphericalCap((0, 0), 0.001, 0.5)
+    if way == "moving":
+        from .render import Renderer  # which needs this module
+
+        Renderer(camera, pane, moving=True).plan(cap).render(np.zeros((SIDE, SIDE, 3), dtype=np.uint8))
+        give_back()
+        return
+    caps = FarCaps.of([cap], camera, pane, np.inf)
     if caps is not None:
         caps.look(np.zeros(1, dtype=np.intp), None, 1, np.ones(1, dtype=np.float32))
     along = np.linspace(0, SPAN, SIDE, dtype=np.float32)
     x, y = (at.reshape(-1, 1) for at in np.meshgrid(along, along))
     tree = Quadtree((SIDE * SPAN,) * 2, 17, 1.0)
-    sums = Pursuit((SIDE * SPAN,) * 2, 1.0, tree) if lasting else tree
+    sums = Pursuit((SIDE * SPAN,) * 2, 1.0, tree) if way == "lasting" else tree
     sums.taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
     _draw()
     give_back()

@@ -37,7 +37,6 @@ from .samples import Samples
 RAYS = 2  # along a pixel's side, to begin with
 CHUNK = 4096  # pixels traced at a time with all their rays
 TOGETHER = 1 << 16  # pixels that are held at a time
-MANY = 1 << 17  # pixels of a plan whose loops are compiled before its tables take memory
 OUTLINE = 2
 """Times as many rays along a side at the outline of a drop, for plans that last."""
 CLEAR_STEP = 8
@@ -125,10 +124,10 @@ class Minifier:
         small: list[Lookups] = []
         wide: list[Lookups] = []
         size = every = 0
-        if sum(len(batch.pixels) for batch in batches) > MANY:
-            from .compile_ahead import compile_ahead  # which needs `paste`
+        from .compile_ahead import MANY, compile_ahead  # which needs `paste`
 
-            compile_ahead(self.lasting)
+        if sum(len(batch.pixels) for batch in batches) > MANY:
+            compile_ahead("lasting" if self.lasting else "default")
         for table in self._one_by_one(batches):
             every += len(table.texels)
             if size + table.size > self._joined:  # before the next ones come: the memory of these serves them

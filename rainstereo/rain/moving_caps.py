@@ -151,6 +151,10 @@ class CapScene:
         """Run the loops over caps, see `compiled.cap_frames.frame`."""
         from rainstereo.compiled.cap_frames import desk, frame
 
+        from .compile_ahead import MANY, compile_ahead  # which needs `render`
+
+        if math.pi * float(np.square(caps.circles[:, 2]).sum()) > MANY:
+            compile_ahead("moving")
         lattice, boxes = self.lattice, self.boxes
         border = 0 if self.border == "mirror" else 1
         shift = np.float32(self.shift[0]), np.float32(self.shift[1])
@@ -277,7 +281,7 @@ class CapTable:
 
     def values(self, image: Image, below: Image) -> Array:
         """What the table's pixels show, (M, C) float32, of any image (h, w, C); below: the frame's part of it."""
-        found = self._tabulated
+        found = self._looks
         texels = np.concatenate([self.scene.boxes.numbers(image), image.reshape(-1, image.shape[2]).astype(np.float32)])
         ends = np.concatenate([[0], np.cumsum(found.counts)])
         taps = csr_array((found.weights, found.texels, ends), shape=(len(found.pixels), len(texels)))
@@ -288,44 +292,52 @@ class CapTable:
     @property
     def pixels(self) -> Any:
         """(M,) numbers of pixels, row by row of the frame."""
-        return self._tabulated.pixels
+        return self._rows.pixels
 
     @property
     def groups(self) -> Any:
         """(M,) of the caps that were planned together."""
-        return self.caps[self._tabulated.caps, 5].astype(np.int32)
+        return self.caps[self._rows.caps, 5].astype(np.int32)
 
     @property
     def clear(self) -> Array:
         """(M,) share of each pixel that no cap hides."""
-        return self._tabulated.clear
+        return self._rows.clear
 
     @property
     def displacement(self) -> Array:
         """(M, 2) from a pixel to the mean of what it looks at; NaN where it is dark."""
-        return self._tabulated.displacement
+        return self._rows.displacement
 
     @property
     def unknown(self) -> Mask:
         """(M,) whether a ray may fall beyond the image."""
-        return self._tabulated.unknown
+        return self._rows.unknown
 
     @cached_property
-    def _tabulated(self) -> _Tabulated:
+    def _rows(self) -> _Tabulated:
+        """What is known of pixels, without what they look at, which takes ten times the memory."""
+        return self._tabulated(False)
+
+    @cached_property
+    def _looks(self) -> _Tabulated:
+        return self._tabulated(True)
+
+    def _tabulated(self, with_taps: bool) -> _Tabulated:
         width, height = self.scene.camera.size
         out, image = (np.zeros((h, w, 0), dtype=np.uint8) for w, h in ((width, height), self.scene.size))
         words = np.zeros(self.scene.boxes.count, dtype=np.uint32)
         record = _record(0, 0)
         self.scene.go(COUNT, out, image, words, self, record)
         pixels, taps = record[-1].tolist()
-        record = _record(pixels, taps)
+        record = _record(pixels, taps if with_taps else 0)
         self.scene.go(FILL, out, image, words, self, record)
         return _Tabulated(*record[:-1])
 
 
 @dataclass(frozen=True, eq=False)
 class _Tabulated:
-    """What the loops wrote down: of M pixels and T taps."""
+    """What the loops wrote down: of M pixels, and of T taps or none."""
 
     pixels: Any
     caps: Any

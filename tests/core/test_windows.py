@@ -158,15 +158,30 @@ def test_loops_compiled_ahead_are_those_that_draw(lasting, monkeypatch):
 
     loops = [pursuit.choose] if lasting else []
     loops += [far_face.look, ray_steps.brought_in, merged_cells.merge]
-    loops += [orders.reorder, cells.cut, cells.interleave, cells.draw, sums.sum_quads, sums.sum_products]
+    loops += [orders.reorder, cells.cut, cells.pair, cells.interleave, cells.draw, sums.sum_quads, sums.sum_products]
     loops += [windows.places, quads.pack, quads.pack_some, quads.average, quads.halve]
     renderer = Renderer(Camera.pinhole(400, 400, 101, 75, *SIZE), PANE, lasting=lasting)
     compile_ahead.cache_clear()
-    compile_ahead(lasting)
+    compile_ahead("lasting" if lasting else "default")
     before = [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
     monkeypatch.setattr(minified, "LARGE", 1000)
     plan = renderer.plan([SphericalCap((0.0, 0.0), 1e-3, 0.9), SphericalCap((3e-3, 0.0), 5e-4, 0.9)])
     plan.apply(np.zeros((*SIZE[::-1], 3), dtype=np.uint8))
+    assert [len(loop.signatures) for loop in loops] == before  # type: ignore[attr-defined]
+
+
+@needs_numba
+def test_loops_compiled_ahead_are_those_that_draw_moving_drops():
+    from rainstereo.compiled import boxes, cap_frames, cap_outlines
+
+    loops = [cap_frames.frame, cap_outlines.outline, cap_outlines.tabulated, boxes.every_box]
+    compile_ahead.cache_clear()
+    compile_ahead("moving")
+    before = [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
+    lens = np.array([400, 400, 101, 75, 0.1, -0.02, 0.001, 0.002])
+    for camera in (Camera.pinhole(400, 400, 101, 75, *SIZE), Camera("LENSMODEL_OPENCV4", lens, *SIZE)):
+        plan = Renderer(camera, PANE, moving=True, border="edge").plan([SphericalCap((0.0, 0.0), 1e-3, 0.9)])
+        plan.render(np.zeros((*SIZE[::-1], 3), dtype=np.uint8))
     assert [len(loop.signatures) for loop in loops] == before  # type: ignore[attr-defined]
 
 
@@ -179,21 +194,21 @@ def test_another_process_compiles_once_and_whatever_becomes_of_it_this_one_goes_
     told, here = [], []
     monkeypatch.setattr(ahead.subprocess, "run", lambda command, **_: told.append(command))
     monkeypatch.setattr(ahead, "compile_here", here.append)
-    for way in (True, True, False):
+    for way in ("lasting", "lasting", "moving"):
         compile_ahead.cache_clear()
         compile_ahead(way)
-    assert here == [True, True, False]
-    assert ["compile_here(True)" in command[2] for command in told] == [True, False]
+    assert here == ["lasting", "lasting", "moving"]
+    assert ["compile_here('lasting')" in command[2] for command in told] == [True, False]
     for each in tmp_path.iterdir():
         each.unlink()
     with monkeypatch.context() as other:
         other.setattr(sys, "executable", "/usr/bin/blender")
         compile_ahead.cache_clear()
-        compile_ahead(True)
+        compile_ahead("lasting")
     monkeypatch.setattr(ahead.subprocess, "run", None)  # as if no process could be started
     compile_ahead.cache_clear()
-    compile_ahead(True)
-    assert here[3:] == [True, True]
+    compile_ahead("lasting")
+    assert here[3:] == ["lasting"] * 2
     assert len(told) == 2
     assert not list(tmp_path.iterdir())
     compile_ahead.cache_clear()
