@@ -36,7 +36,7 @@ SHARPNESS = np.uint64(64 * 56)  # 1 / `SPREAD`
 PLANES = 57
 Y_, GAIN = np.uint64(64), np.uint64(128)  # from where x of the places is
 
-ZERO, ONE, HALF, FOUR = np.float32(0), np.float32(1), np.float32(0.5), np.float32(4)
+ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 ALONG = np.float32(1e-9)  # as in the tracer
 CAP_X, CAP_Y, CAP_SQUARE, CAP_DEPTH, CAP_CURVATURE, CAP_INDEX, CAP_DIM = range(7)
 """Columns of a table of caps, float64: centre in the panel frame, contact radius squared, depth of the sphere's centre

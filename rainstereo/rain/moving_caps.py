@@ -374,10 +374,6 @@ def _record(pixels: int, taps: int) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
-def _middles(count: int) -> Array:
-    return (np.arange(count) + 0.5) / count - 0.5
-
-
 def _behind(chamber: Chamber, panel: int) -> tuple[Any, float]:
     """Faces behind a panel's far one, (F, 3), and the distance of the last face of all: see `compiled.cap_rays`."""
     later, here, index = [], float(chamber.faces[panel]) + chamber.panels[panel].thickness, 1.0

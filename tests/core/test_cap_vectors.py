@@ -136,7 +136,7 @@ def test_patches_are_means_over_grids_of_boxes(border: str, first: int) -> None:
     found = flat[where].reshape(64, 3)
     off = np.abs(found - expected)
     assert expected.max() > 50
-    assert off.max() < 1.5  # a look between two boxes may fall to either
+    assert off.max() < 0.2, off.max()  # a look between two eighths may fall to either
     assert np.median(off[chosen]) < 1e-3
     assert not found[np.setdiff1d(np.arange(64), chosen)].any()
 
