@@ -37,7 +37,7 @@ BIAS = np.float32(0.125)
 """Gray levels by which words are too large: halves are rounded up where an image is halved."""
 MIRROR, EDGE, INSIDE = 0, 1, 2
 """How the scene goes on beyond its edges; or that nothing lies beyond them."""
-EIGHTHS = np.float32(8)
+EIGHTHS = 8  # to which the place between four boxes is told, along and down
 FARTHEST = np.float32(1e6)  # pixels; what lies beyond is not told apart
 MOST = 12
 """Looks along a small patch's side."""
@@ -113,7 +113,7 @@ def look_at_box(
 
     start, pitch, inverse: of the boxes' size. border: `INSIDE`, if all looks of the patch are.
     """
-    one = inverse * EIGHTHS
+    one = inverse * np.float32(EIGHTHS)
     s = (np.float32(a) + HALF) / rays[ACROSS + j] - HALF
     t = (np.float32(b) + HALF) / rays[DOWN + j] - HALF
     x, y = place_on(rays, j, s, t)
@@ -121,8 +121,8 @@ def look_at_box(
         x, y = folded(x, last[0], border), folded(y, last[1], border)
     middle = HALF * one + HALF
     column, row = np.int64(x * one + middle), np.int64(y * one + middle)
-    u, v = np.float32(column & 7) / EIGHTHS, np.float32(row & 7) / EIGHTHS
-    return start + (row >> 3) * pitch + (column >> 3), u, v
+    u, v = np.float32(column % EIGHTHS) / np.float32(EIGHTHS), np.float32(row % EIGHTHS) / np.float32(EIGHTHS)
+    return start + row // EIGHTHS * pitch + column // EIGHTHS, u, v
 
 
 @fused_part

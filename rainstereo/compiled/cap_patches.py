@@ -13,7 +13,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from .cap_lanes import Lanes
-from .cap_looks import BIAS, EDGE, INSIDE, MIRROR
+from .cap_looks import BIAS, EDGE, EIGHTHS, INSIDE, MIRROR
 from .cap_rays import HIDDEN, MARK, PATCH, RIVAL, SHOWN, ZERO
 from .cap_tiles import ACROSS, DOWN, FAR, GAINS, LITS, SIZE, WHOLE
 from .cap_vectors import REALS, WIDE, WORDS, above, above_zero, folded, lanes_from, lowest, pairs_times
@@ -24,7 +24,6 @@ from .prefetch import call
 EIGHT, LANES = np.uint64(WIDE), np.uint64(0xFF)
 MOST = 64  # looks a pixel
 PLACES = MOST * WIDE  # of the boxes of eight pixels
-EIGHTHS = 8  # to which the place between four boxes is told, along and down
 room_for: Any = vars(cgutils)["alloca_once"]
 constant: Any = vars(cgutils)["global_constant"]
 BYTES, SHORTS = ir.VectorType(BYTE, WIDE), ir.VectorType(TWO, WIDE)

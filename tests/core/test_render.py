@@ -431,7 +431,7 @@ print((peak - base) / 1024, peak / 1024, found.drop_mask.mean())
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory is read from Linux's /proc")
-@pytest.mark.parametrize(("way", "most"), [("lasting=False", 430), ("lasting=True", 500), ("moving=True", 500)])
+@pytest.mark.parametrize(("way", "most"), [("lasting=False", 430), ("lasting=True", 500), ("moving=True", 400)])
 def test_ten_thousand_drops_in_bounded_memory(way, most):
     """The whole process, and whatever must be compiled first."""
     told = MEMORY.replace("WAY", way)
