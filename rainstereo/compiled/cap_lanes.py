@@ -13,14 +13,14 @@ from typing import Any
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from .cap_vectors import REALS, WIDE, folded
-from .llvm import LONG, arguments, ir, load, spread, store
+from .cap_vectors import REALS, WIDE, WORDS, folded
+from .llvm import FOUR, LONG, REAL, arguments, ir, load, spread, store
 
 SIDE = 4  # samples along a pixel's side where a cap hangs over
 declared: Any = vars(cgutils)["get_or_insert_function"]
 Number = Any  # Lanes, or a float that is the same in all of them
 FUSED = ("contract",)
-KX, KY, KZ, DIM, RISE = (64 * i for i in (2, 3, 4, 5, 6))
+KX, KY, KZ, DIM, RISE, NEXT, LITS = (64 * i for i in (2, 3, 4, 5, 6, 9, 23 + 17))
 PY, Y_, GAIN = 64, 64, 128
 
 
@@ -101,7 +101,7 @@ def _loop(signature: Callable[[Any], Any], body: Callable[..., None]) -> Any:
 
     def code(context: Any, builder: Any, found: Any, given: Any) -> Any:
         data, first, last, to, *numbers = arguments(context, builder, found, given)
-        every = [Lanes.of(builder, number) for number in numbers]
+        every = [Lanes.of(builder, each) if each.type == REAL else each for each in numbers]
         with cgutils.for_range_slice(builder, first, last, LONG(WIDE), LONG) as (lane, _):
 
             def at(plane: int) -> Lanes:
@@ -117,6 +117,14 @@ def _loop(signature: Callable[[Any], Any], body: Callable[..., None]) -> Any:
         return context.get_dummy_value()
 
     return signature, code
+
+
+def _on_line(builder: Any, line: Any, lane: Any, s: Lanes, planes: int) -> list[Lanes]:
+    """Polynomials of a row, three coefficients each, at eight of its places: s + lane and on."""
+    numbers = builder.add(spread(builder, builder.trunc(lane, FOUR), WORDS), ir.Constant(WORDS, list(range(WIDE))))
+    at = Lanes(builder, builder.sitofp(numbers, REALS)) + s
+    c = [Lanes.of(builder, builder.load(builder.gep(line, [LONG(k)]))) for k in range(3 * planes)]
+    return [c[3 * k] + at * (c[3 * k + 1] + at * c[3 * k + 2]) for k in range(planes)]
 
 
 def _arguments(rays: Any, count: int) -> Any:
@@ -199,6 +207,64 @@ def _through_soft(
     return _loop(_arguments(rays, 4), _through_cap(True))
 
 
+@intrinsic
+def _taken_up(_context: Any, rays: Any, _first: Any, _last: Any, _to: Any, line: Any, _s: Any) -> Any:
+    def body(builder: Any, data: Any, at: Any, put: Any, there: Any, line: Any, s: Lanes) -> None:
+        px, py, kx, ky, dim = _on_line(builder, line, there(0), s, 5)
+        put(0, px)
+        put(PY, py)
+        put(KX, kx)
+        put(KY, ky)
+        put(DIM, dim)
+
+    long = types.uint64
+    return _loop(types.void(rays, long, long, long, line, types.float32), body)
+
+
+@intrinsic
+def _with_room(_context: Any, rays: Any, _first: Any, _last: Any, _to: Any, line: Any, _s: Any, _square: Any) -> Any:
+    def body(builder: Any, data: Any, at: Any, put: Any, there: Any, line: Any, s: Lanes, square: Lanes) -> None:
+        x, y = _on_line(builder, line, there(0), s, 2)
+        put(NEXT, square - x * x - y * y)
+
+    long, real = types.uint64, types.float32
+    return _loop(types.void(rays, long, long, long, line, real, real), body)
+
+
+@intrinsic
+def _behind(_context: Any, rays: Any, _first: Any, _last: Any, _to: Any, _a: Any, _b: Any, _c: Any, _d: Any) -> Any:
+    def body(
+        builder: Any, data: Any, at: Any, put: Any, there: Any, square: Lanes, depth: Lanes, scale: Lanes, q: Lanes
+    ) -> None:
+        px, py, kx, ky = at(0), at(PY), at(KX), at(KY)
+        b = (q - kx * kx - ky * ky).root() * depth + px * kx + py * ky
+        ((b * b + (square - px * px - py * py) * q) * scale + (1.0 - q)).put(data, there(0))
+
+    return _loop(_arguments(rays, 4), body)
+
+
+@intrinsic
+def _lit_of(
+    _context: Any, rays: Any, _first: Any, _last: Any, _to: Any, above: Any, below: Any, _whole: Any, _partly: Any
+) -> Any:
+    def body(
+        builder: Any, data: Any, at: Any, put: Any, there: Any, above: Any, below: Any, whole: Lanes, partly: Lanes
+    ) -> None:
+        lane = there(0)
+        corners = [
+            Lanes.at(builder, data, builder.add(builder.add(lane, plane), LONG(right)))
+            for plane in (above, below)
+            for right in range(2)
+        ]
+        least, most = corners[0], corners[0]
+        for gain in corners[1:]:
+            least, most = least.where(gain.above(least), gain), most.where(most.above(gain), gain)
+        put(LITS, whole.where(least.above(0.0), partly.where(most.above(0.0))))
+
+    long, real = types.uint64, types.float32
+    return _loop(types.void(rays, long, long, long, long, long, real, real), body)
+
+
 def _to_scene(
     builder: Any, data: Any, at: Any, put: Any, there: Any, cx: Any, cy: Any, m0: Any, m1: Any, m2: Any, m3: Any,
     m4: Any, m5: Any, m6: Any, m7: Any, m8: Any, u0: Any, v0: Any, end: Any, inverse: Any, along: Any,
@@ -256,6 +322,17 @@ def _places_of(half: int) -> tuple[list[int], list[int]]:
     return [lane % SIDE for lane in range(WIDE)], [(WIDE * half + lane) // SIDE for lane in range(WIDE)]
 
 
+taken_up: Any = _taken_up
+"""taken_up(rays, first, last, 0, line, s): rays of lanes, from a row's polynomials, s + lane pixels along it."""
+with_room: Any = _with_room
+"""with_room(rays, first, last, 0, line, s, square): contact radius squared less the square of the distance from the
+centre, of a row's rays on the face."""
+behind: Any = _behind
+"""behind(rays, first, last, to, square, depth, curvature squared, q): the square of the component, along the normal
+behind the cap, of rays that have been taken up; negative where no light comes through."""
+lit_of: Any = _lit_of
+"""lit_of(rays, first, last, 0, above, below, whole, partly): of pixels, by the gains at their corners, whose planes are
+those given: whether all are lit, some, or none."""
 side_sum: Any = _side_sum
 """side_sum(px, py, kx, ky, kz, radius, depth, xu, xv, yu, yv, per): of the shares that a pixel's samples stand for
 which a cap hides (`cap_shares.side_share`); per: samples along a side over metres a pixel."""

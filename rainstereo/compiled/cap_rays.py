@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .cap_lanes import through_hard, through_soft, to_scene
+from .cap_lanes import taken_up, through_hard, through_soft, to_scene, with_room
 from .compile import fused_part
 
 PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
@@ -49,6 +49,7 @@ which the lens model folds back; fx, fy and its coefficients, OpenCV's first 12 
 
 STEP = 8  # pixels between nodes
 X_NODE, Y_NODE, KX_NODE, KY_NODE, DIM_NODE = range(5)
+EIGHT = np.uint64(8)
 
 
 @fused_part
@@ -91,27 +92,14 @@ def of_row(tile: Any, t: Any, line: Any) -> None:
 
 @fused_part
 def take_up(line: Any, s: Any, low: Any, high: Any, rays: Any) -> None:
-    """Rays of lanes low to before high, s + lane pixels along a row."""
-    x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
-    a0, a1, a2, b0, b1, b2 = line[6], line[7], line[8], line[9], line[10], line[11]
-    d0, d1, d2 = line[12], line[13], line[14]
-    for j in range(np.uint64(low), np.uint64(high)):
-        at = s + np.float32(np.int32(j))
-        rays[PX + j] = x0 + at * (x1 + at * x2)
-        rays[PY + j] = y0 + at * (y1 + at * y2)
-        rays[KX + j] = a0 + at * (a1 + at * a2)
-        rays[KY + j] = b0 + at * (b1 + at * b2)
-        rays[DIM + j] = d0 + at * (d1 + at * d2)
+    """Rays of lanes low to before high, whole vectors, s + lane pixels along a row."""
+    taken_up(rays, np.uint64(low), np.uint64(high), PX, line, np.float32(s))
 
 
 @fused_part
 def room_of_row(line: Any, s: Any, lanes: Any, square: Any, rays: Any) -> None:
     """Contact radius squared less the square of the distance from the centre, of a row's rays on the face."""
-    x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
-    for j in range(np.uint64(lanes)):
-        at = s + np.float32(np.int32(j))
-        x, y = x0 + at * (x1 + at * x2), y0 + at * (y1 + at * y2)
-        rays[NEXT + j] = square - x * x - y * y
+    with_room(rays, PX, np.uint64(lanes), PX, line, np.float32(s), square)
 
 
 @fused_part
@@ -141,19 +129,21 @@ def onward(cap: Any, later: Any, view: Any, rays: Any, first: Any, last: Any, to
     """Rays behind a cap's surface, through the rest of the chamber and to the scene; see `cross`."""
     for face in range(len(later)):
         thick, q1, q2 = later[face, 0], later[face, 1] * later[face, 1], later[face, 2] * later[face, 2]
-        for j in range(first, last):
-            kz = rays[KZ + j]
-            step = (thick - rays[RISE + j]) / kz
-            rays[PX + j] += step * rays[KX + j]
-            rays[PY + j] += step * rays[KY + j]
-            rays[RISE + j] = ZERO
-            inside = kz * kz + (q2 - q1)
-            turned = np.float32(math.sqrt(inside))
-            p, t = q2 * kz + q1 * turned, kz + turned
-            pt = p * t
-            passed = (kz * turned + kz * turned) * (p * p + q1 * q2 * t * t) / (pt * pt)
-            rays[KZ + j] = turned
-            rays[to + GAIN + j] *= passed if inside > ZERO else ZERO
+        for block in range(np.uint64(first), np.uint64(last), EIGHT):
+            for lane in range(EIGHT):
+                j = block + lane
+                kz = rays[KZ + j]
+                step = (thick - rays[RISE + j]) / kz
+                rays[PX + j] += step * rays[KX + j]
+                rays[PY + j] += step * rays[KY + j]
+                rays[RISE + j] = ZERO
+                inside = kz * kz + (q2 - q1)
+                turned = np.float32(math.sqrt(inside))
+                p, t = q2 * kz + q1 * turned, kz + turned
+                pt = p * t
+                passed = (kz * turned + kz * turned) * (p * p + q1 * q2 * t * t) / (pt * pt)
+                rays[KZ + j] = turned
+                rays[to + GAIN + j] *= passed if inside > ZERO else ZERO
     _project(np.float32(cap[CAP_X]), np.float32(cap[CAP_Y]), view, rays, first, last, to)
 
 

@@ -43,6 +43,7 @@ pixel are somewhat longer than its side."""
 FAR_LESS = np.float32(1e9)  # room: none at all
 FEW = 24  # lanes all of whose shares are computed
 ALIKE = 1e-6  # of a cap's room: less of a difference is rounding
+EIGHT = np.uint64(8)
 
 
 @fused_part
@@ -101,14 +102,16 @@ def contacts(
                   tile[0, 1, 2] + two * tile[0, 2, 2])  # fmt: skip
     b0, b1, b2 = (tile[1, 1, 0] + two * tile[1, 2, 0], tile[1, 1, 1] + two * tile[1, 2, 1],
                   tile[1, 1, 2] + two * tile[1, 2, 2])  # fmt: skip
-    for j in range(np.uint64(low), np.uint64(high)):
-        at = s + np.float32(np.int32(j))
-        x, y = x0 + at * (x1 + at * x2), y0 + at * (y1 + at * y2)
-        xu, yu = x1 + (at + at) * x2, y1 + (at + at) * y2
-        xv, yv = a0 + at * (a1 + at * a2), b0 + at * (b1 + at * b2)
-        share = contact_share(x, y, radius, xu, xv, yu, yv)
-        share = share if share > ZERO else ZERO
-        rays[HIDDEN + j] = ONE if rays[ROOM + j] > edge else share
+    for block in range(np.uint64(low), np.uint64(high), EIGHT):
+        for lane in range(EIGHT):
+            j = block + lane
+            at = s + np.float32(np.int32(j))
+            x, y = x0 + at * (x1 + at * x2), y0 + at * (y1 + at * y2)
+            xu, yu = x1 + (at + at) * x2, y1 + (at + at) * y2
+            xv, yv = a0 + at * (a1 + at * a2), b0 + at * (b1 + at * b2)
+            share = contact_share(x, y, radius, xu, xv, yu, yv)
+            share = share if share > ZERO else ZERO
+            rays[HIDDEN + j] = ONE if rays[ROOM + j] > edge else share
 
 
 @fused_part
@@ -147,18 +150,20 @@ def _by_sides(tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, cap: 
     depth, radius = np.float32(cap[CAP_DEPTH]), np.float32(math.sqrt(cap[CAP_SQUARE]))
     broad, two, square = np.float32(wide), np.float32(2), radius * radius
     near, out = two * broad, (radius + broad) * (radius + broad)
-    for j in range(np.uint64(lanes)):
-        px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
-        kz = np.float32(math.sqrt(ONE - kx * kx - ky * ky))
-        b = px * kx + py * ky + kz * depth  # what the ray has to go yet to where it is closest to the sphere's centre
-        gx, gy, r2 = b * kx - px, b * ky - py, px * px + py * py
-        past = -broad * (two * np.float32(math.sqrt(gx * gx + gy * gy)) + broad)  # more than a pixel beside the sphere
-        meets = ONE if b * b + square - r2 >= past else ZERO
-        meets = ONE if r2 <= out else meets
-        meets = meets if b < near else ZERO  # only before it can it meet the side
-        meets = meets if rays[HIDDEN + j] < ONE else ZERO
-        rays[MARK + j] = ZERO if rays[ROOM + j] > edge else meets
-        rays[FREE + j] = b
+    for block in range(np.uint64(0), np.uint64(lanes), EIGHT):
+        for lane in range(EIGHT):
+            j = block + lane
+            px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
+            kz = np.float32(math.sqrt(ONE - kx * kx - ky * ky))
+            b = px * kx + py * ky + kz * depth  # what the ray has to go yet to where it is closest to the sphere's centre
+            gx, gy, r2 = b * kx - px, b * ky - py, px * px + py * py
+            past = -broad * (two * np.float32(math.sqrt(gx * gx + gy * gy)) + broad)  # more than a pixel beside the sphere
+            meets = ONE if b * b + square - r2 >= past else ZERO
+            meets = ONE if r2 <= out else meets
+            meets = meets if b < near else ZERO  # only before it can it meet the side
+            meets = meets if rays[HIDDEN + j] < ONE else ZERO
+            rays[MARK + j] = ZERO if rays[ROOM + j] > edge else meets
+            rays[FREE + j] = b
     left = lanes_from(above_zero(rays, MARK), 0, lanes)
     while left:
         j = lowest(left)
@@ -206,16 +211,18 @@ def taken(
         edge = np.float32(1.45 * math.sqrt(caps[other, CAP_SQUARE]) * wide + wide * wide)
         part = np.float32(1.45 * math.sqrt(dx * dx + dy * dy) * wide)  # how much rooms differ within a pixel
         name = np.float32(other + 1)
-        for j in range(np.uint64(begin), np.uint64(begin + (end - begin + 7) // 8 * 8)):
-            px, py, kx, ky = rays[PX + j] - dx, rays[PY + j] - dy, rays[KX + j], rays[KY + j]
-            room = square - px * px - py * py
-            b = px * kx + py * ky + np.float32(math.sqrt(ONE - kx * kx - ky * ky)) * depth
-            by_side = room + b * b if b < ZERO else room
-            more = room - (rays[ROOM + j] + need)
-            more = more if by_side > -edge else -FAR_LESS
-            rays[HIDDEN + j] *= ZERO if more > ZERO else ONE
-            near = ONE if more > -part else ZERO
-            rays[RIVAL + j] += near * (name - rays[RIVAL + j])
+        for block in range(np.uint64(begin), np.uint64(end), EIGHT):
+            for lane in range(EIGHT):
+                j = block + lane
+                px, py, kx, ky = rays[PX + j] - dx, rays[PY + j] - dy, rays[KX + j], rays[KY + j]
+                room = square - px * px - py * py
+                b = px * kx + py * ky + np.float32(math.sqrt(ONE - kx * kx - ky * ky)) * depth
+                by_side = room + b * b if b < ZERO else room
+                more = room - (rays[ROOM + j] + need)
+                more = more if by_side > -edge else -FAR_LESS
+                rays[HIDDEN + j] *= ZERO if more > ZERO else ONE
+                near = ONE if more > -part else ZERO
+                rays[RIVAL + j] += near * (name - rays[RIVAL + j])
 
 
 @fused_part

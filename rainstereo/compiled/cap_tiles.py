@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .cap_lanes import behind, lit_of
 from .cap_rays import (
     ABOVE,
     BELOW,
@@ -62,6 +63,7 @@ LARGEST = np.float32(120 * 120)
 """Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
 LARGEST_ALONE = np.float32(80 * 80)
 """The same where a neighbour's middle is dark, so that it is less sure how the patch is bent."""
+EIGHT = np.uint64(8)
 
 
 @fused_part
@@ -106,11 +108,8 @@ def lit_span(line: Any, s: Any, low: Any, high: Any, cap: Any, rays: Any) -> Any
     """Between which lanes rays that have been taken up come through the cap, or nearly."""
     square, depth, curvature = np.float32(cap[CAP_SQUARE]), np.float32(cap[CAP_DEPTH]), np.float32(cap[CAP_CURVATURE])
     q = np.float32(cap[CAP_INDEX] * cap[CAP_INDEX])
-    per, less = curvature * curvature, np.float32(1) - q
-    for j in range(np.uint64(low), np.uint64(high)):
-        px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
-        b = np.float32(math.sqrt(q - kx * kx - ky * ky)) * depth + px * kx + py * ky
-        rays[MARK + j] = (b * b + (square - px * px - py * py) * q) * per + less
+    first, last = np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)
+    behind(rays, first, last, MARK, square, depth, curvature * curvature, q)
     return ends(lanes_from(above(rays, MARK, -NEARLY), low, high))
 
 
@@ -164,17 +163,8 @@ def row_of_tile(
 @fused_part
 def lit(rays: Any, low: Any, high: Any) -> None:
     """Fill the plane `LITS` from low to before high."""
-    one = np.uint64(1)
-    for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
-        a, b, c, d = (
-            rays[ABOVE + GAIN + j],
-            rays[BELOW + GAIN + j],
-            rays[ABOVE + GAIN + j + one],
-            rays[BELOW + GAIN + j + one],
-        )
-        p, q, r, u = (a if a < b else b), (c if c < d else d), (a if a > b else b), (c if c > d else d)
-        least, most = (p if p < q else q), (r if r > u else u)
-        rays[LITS + j] = WHOLE if least > ZERO else PARTLY if most > ZERO else ZERO
+    last = np.uint64(low + (high - low + 7) // 8 * 8)
+    lit_of(rays, np.uint64(low), last, PX, ABOVE + GAIN, BELOW + GAIN, WHOLE, PARTLY)
 
 
 @fused_part
@@ -207,58 +197,62 @@ def patches(rays: Any, low: Any, high: Any, bands: Any, sizes: Any, shift: Any, 
     small_area, aim0, aim1 = bands[0, AREAS], bands[0, AIMS], bands[1, AIMS]
     largest, nought, below = np.int32(sizes - 1), np.int32(0), np.int32(-1)
     one, tiny, small, two = np.uint64(1), np.float32(1e-20), np.float32(1 / 24), np.float32(2)
-    for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
-        before, after = rays[OWN + GAIN + j - one], rays[OWN + GAIN + j + one]
-        known = (before if before < after else after) > ZERO
-        g, ag, bg, agg, bgg, _ = bent(rays, GAIN + j, known, HALF)
-        steep = ag * ag / (ag * ag + bg * bg + tiny)  # light ends there, and across that line places change
-        rays[GAINS + j] = g + (agg + bgg) * small
-        cx, ax, bx, axx, bxx, mixed = bent(rays, j, known, steep)
-        cx += dx
-        out = reach(ax, bx, axx, bxx, mixed)
-        p, q, over = cx - out, end_x - cx - out, out - end_x
-        far = p if p < q else q
-        rays[CX + j] = cx
-        rays[AX + j] = ax
-        rays[BX + j] = bx
-        rays[AXX + j] = axx
-        rays[BXX + j] = bxx
-        rays[ABX + j] = mixed
-        cy, ay, by, ayy, byy, mixed = bent(rays, Y_ + j, known, steep)
-        cy += dy
-        out = reach(ay, by, ayy, byy, mixed)
-        p, q = cy - out, end_y - cy - out
-        over = over if over > out - end_y else out - end_y
-        p = p if p < q else q
-        rays[CY + j] = cy
-        rays[AY + j] = ay
-        rays[BY + j] = by
-        rays[AYY + j] = ayy
-        rays[BYY + j] = byy
-        rays[ABY + j] = mixed
-        far = far if far < p else p
-        rays[FAR + j] = far
-        most = LARGEST if known else LARGEST_ALONE
-        rays[SIZE + j] = most if over < ZERO else ZERO  # for now; what is wider than the scene folds more than once
-    for j in range(np.uint64(low), np.uint64(low + (high - low + 7) // 8 * 8)):
-        ax, ay, bx, by = rays[AX + j], rays[AY + j], rays[BX + j], rays[BY + j]
-        most = rays[SIZE + j]
-        area = abs(ax * by - ay * bx)
-        aim = aim0 if area < small_area else aim1
-        ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))
-        across = np.float32(math.sqrt(aim * np.float32(math.sqrt(ratio)))) + HALF
-        across = across if across < HALF * aim else HALF * aim
-        across = np.float32(np.int32(across if across > two else two))
-        down = np.float32(np.int32(aim / across))
-        down = down if down > two else two
-        rays[ACROSS + j] = across
-        rays[DOWN + j] = down
-        octaves = (np.float32(area / (across * down) * SMALLEST).view(np.int32) >> np.int32(23)) - np.int32(127)
-        size = octaves if octaves > nought else nought
-        size = size if size < largest else largest
-        rays[SIZE + j] = np.float32(size if octaves >= below else below)
-        lights = rays[LITS + j]
-        rays[LITS + j] = lights if area < most or not lights > PARTLY else PARTLY
+    for block in range(np.uint64(low), np.uint64(high), EIGHT):
+        for lane in range(EIGHT):
+            j = block + lane
+            before, after = rays[OWN + GAIN + j - one], rays[OWN + GAIN + j + one]
+            known = (before if before < after else after) > ZERO
+            g, ag, bg, agg, bgg, _ = bent(rays, GAIN + j, known, HALF)
+            steep = ag * ag / (ag * ag + bg * bg + tiny)  # light ends there, and across that line places change
+            rays[GAINS + j] = g + (agg + bgg) * small
+            cx, ax, bx, axx, bxx, mixed = bent(rays, j, known, steep)
+            cx += dx
+            out = reach(ax, bx, axx, bxx, mixed)
+            p, q, over = cx - out, end_x - cx - out, out - end_x
+            far = p if p < q else q
+            rays[CX + j] = cx
+            rays[AX + j] = ax
+            rays[BX + j] = bx
+            rays[AXX + j] = axx
+            rays[BXX + j] = bxx
+            rays[ABX + j] = mixed
+            cy, ay, by, ayy, byy, mixed = bent(rays, Y_ + j, known, steep)
+            cy += dy
+            out = reach(ay, by, ayy, byy, mixed)
+            p, q = cy - out, end_y - cy - out
+            over = over if over > out - end_y else out - end_y
+            p = p if p < q else q
+            rays[CY + j] = cy
+            rays[AY + j] = ay
+            rays[BY + j] = by
+            rays[AYY + j] = ayy
+            rays[BYY + j] = byy
+            rays[ABY + j] = mixed
+            far = far if far < p else p
+            rays[FAR + j] = far
+            most = LARGEST if known else LARGEST_ALONE
+            rays[SIZE + j] = most if over < ZERO else ZERO  # for now; what is wider than the scene folds more than once
+    for block in range(np.uint64(low), np.uint64(high), EIGHT):
+        for lane in range(EIGHT):
+            j = block + lane
+            ax, ay, bx, by = rays[AX + j], rays[AY + j], rays[BX + j], rays[BY + j]
+            most = rays[SIZE + j]
+            area = abs(ax * by - ay * bx)
+            aim = aim0 if area < small_area else aim1
+            ratio = (ax * ax + ay * ay) / (bx * bx + by * by + np.float32(1e-9))
+            across = np.float32(math.sqrt(aim * np.float32(math.sqrt(ratio)))) + HALF
+            across = across if across < HALF * aim else HALF * aim
+            across = np.float32(np.int32(across if across > two else two))
+            down = np.float32(np.int32(aim / across))
+            down = down if down > two else two
+            rays[ACROSS + j] = across
+            rays[DOWN + j] = down
+            octaves = (np.float32(area / (across * down) * SMALLEST).view(np.int32) >> np.int32(23)) - np.int32(127)
+            size = octaves if octaves > nought else nought
+            size = size if size < largest else largest
+            rays[SIZE + j] = np.float32(size if octaves >= below else below)
+            lights = rays[LITS + j]
+            rays[LITS + j] = lights if area < most or not lights > PARTLY else PARTLY
 
 
 @fused_part
