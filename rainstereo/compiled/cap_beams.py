@@ -18,7 +18,7 @@ from numba.extending import intrinsic
 
 from .boxes import BITS
 from .cap_edges import FORMS, RAYS, SOFTEST, STEEP, WIDER
-from .cap_lanes import Lanes, of_light, refracted
+from .cap_lanes import POLYNOMIALS, Lanes, of_light, refracted
 from .cap_looks import BIAS
 from .cap_rays import GAIN, KX, KY, KZ, PER, PLANES, PX, PY, RISE, SHARE, STRETCH, SUB
 from .cap_shares import SAGITTA
@@ -39,7 +39,7 @@ def _on_tile(builder: Any, tile: Any, plane: int, s: Lanes, t: Lanes) -> Sloped:
     """A tile's polynomial at places of pixels."""
 
     def of(row: int, power: int) -> Lanes:
-        return Lanes.of(builder, builder.load(builder.gep(tile, [LONG(9 * plane + 3 * row + power)])))
+        return Lanes.of(builder, builder.load(builder.gep(tile, [LONG(POLYNOMIALS * row + 3 * plane + power)])))
 
     a, b, c = (of(0, power) + t * (of(1, power) + t * of(2, power)) for power in range(3))
     p, q, r = (of(1, power) + (t + t) * of(2, power) for power in range(3))

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from .cap_lanes import slopes_of_tile
 from .cap_looks import BIAS, folded, pixel_value
 from .cap_rays import (
     CAP_CURVATURE,
@@ -28,7 +29,6 @@ from .cap_rays import (
     KX,
     KY,
     KZ,
-    MARK,
     ONE,
     PER,
     PX,
@@ -47,7 +47,7 @@ from .cap_rays import (
 )
 from .cap_shares import contact_share, from_rival
 from .cap_tiles import LITS, SMALLEST, WHOLE
-from .cap_vectors import above_zero, lanes_from, lowest, sum_of_16, weighed
+from .cap_vectors import lowest, sum_of_16, weighed
 from .compile import fused, fused_part
 from .prefetch import to_read
 
@@ -69,9 +69,7 @@ SIZE_SHIFT, REST, NO_SIZE = np.uint32(SIZE_BITS), np.uint32((1 << SIZE_BITS) - 1
 @fused_part
 def slopes_of_row(tile: Any, t: Any, slopes: Any) -> None:
     """How the polynomials of a row, t pixels from that which a tile's are about, change a pixel down; as `of_row`."""
-    for plane in range(4):
-        for power in range(3):
-            slopes[3 * plane + power] = tile[plane, 1, power] + (t + t) * tile[plane, 2, power]
+    slopes_of_tile(tile, slopes, np.float32(t))
 
 
 @fused_part
@@ -291,19 +289,16 @@ def draw_own(
 @fused_part
 def own_of_row(
     words: Any, scene: Any, starts: Any, last: Any, shift: Any, border: Any, s: Any, u: Any, v: Any, edge: Any,
-    hangs: bool, tiny: bool, caps: Any, number: Any, outlines: Any, later: Any, view: Any, low: Any, high: Any,
-    line: Any, slopes: Any, rays: Any, beams: Any, made: Any, at: Any, pixels: Any, hidden: Any, shown: Any,
-    width: Any, out: Any,
+    hangs: bool, tiny: bool, caps: Any, number: Any, outlines: Any, later: Any, view: Any, left: Any, line: Any,
+    slopes: Any, rays: Any, beams: Any, made: Any, at: Any, pixels: Any, hidden: Any, shown: Any, width: Any, out: Any,
 ) -> Any:  # fmt: skip
-    """Draw those pixels of a row that several caps, or a tiny one, show, as soon as there are `TOGETHER` of them; take
-    them out of `HIDDEN`. Returns how many are left, set out among `beams`; made: how many were.
+    """Draw pixels of a row that several caps, or a tiny one, show, as soon as there are `TOGETHER` of them; take them
+    out of `HIDDEN`. Returns how many are left, set out among `beams`; made: how many were.
 
-    u, v: column of lane 0, and row. line, slopes: of the row. beams: rays of these pixels, planes as `rays` has. at:
-    (64,) uint32; pixels, hidden: (`TOGETHER`,) of each the number of its first byte in `out`, and the share hidden.
+    left: which pixels, as bits. u, v: column of lane 0, and row. line, slopes: of the row. beams: rays of these pixels,
+    planes as `rays` has. at: (64,) uint32; pixels, hidden: (`TOGETHER`,) of each the number of its first byte in `out`,
+    and the share hidden.
     """
-    for each in range(np.uint64(64)):
-        rays[MARK + each] = rays[HIDDEN + each] if tiny or rays[RIVAL + each] > ZERO else ZERO
-    left = lanes_from(above_zero(rays, MARK), low, high)
     while left:
         j = lowest(left)
         left &= left - np.uint64(1)

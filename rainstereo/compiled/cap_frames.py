@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from .cap_beams import TOGETHER as TOGETHER_LIGHT
+from .cap_bytes import call_for, write_bytes
 from .cap_edges import (
     RAYS,
     TOGETHER,
-    WHITE,
     boxes_of_rays,
     draw_own,
     form_of,
@@ -22,10 +22,11 @@ from .cap_edges import (
     slopes_of_row,
     trace_own,
 )
+from .cap_lanes import POLYNOMIALS
 from .cap_light import draw_light, keep_to_boxes, note_light, one_light, room_for_light
 from .cap_looks import is_whole, show_alone
-from .cap_patches import PLACES, show_whole, whole_of_row
-from .cap_rays import CAP_SQUARE, COVER, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit
+from .cap_patches import PLACES, show_whole
+from .cap_rays import CAP_SQUARE, HALF, HIDDEN, ONE, PLANES, RIVAL, ROOM, SHOWN, ZERO, fit
 from .cap_records import PIXELS, TAPS, add_places, record_rays, record_whole
 from .cap_shares import shares_of_row, taken
 from .cap_tiles import (
@@ -39,6 +40,7 @@ from .cap_tiles import (
     LITS,
     OUT_RADIUS,
     OUT_RIVALS,
+    PARTLY,
     SIZE,
     TILE,
     TINY,
@@ -50,12 +52,11 @@ from .cap_tiles import (
     row_of_tile,
     widest,
 )  # fmt: skip
-from .cap_vectors import above, lowest, thrice
-from .compile import fused, fused_part
+from .cap_vectors import above, above_zero, lanes_from, lowest
+from .compile import fused
 from .layout import DRAW, FILL
-from .prefetch import to_write
 
-EIGHT, NONE, ONE_LANE = np.uint64(8), np.uint64(0), np.uint64(1)
+NONE, ONE_LANE = np.uint64(0), np.uint64(1)
 
 
 @fused
@@ -127,26 +128,28 @@ def frame(
                         continue
                     for j in range(np.uint64(3 * 64)):
                         rays[SHOWN + j] = ZERO
-                    every = whole_of_row(begin, end, rays)
-                    if tiny:
-                        every = NONE
+                    hidden_by = above_zero(rays, HIDDEN)
+                    shared = hidden_by if tiny else hidden_by & above_zero(rays, RIVAL)
+                    lone, whole = hidden_by & ~shared, above(rays, LITS, PARTLY)
+                    every = lanes_from(lone & whole, begin, end)
                     alone = every & ~above(rays, SIZE, -HALF)
                     every &= ~alone
-                    if not tiny:
-                        waiting = note_light(
-                            s, t, v * width + u1, scene.shape[2], low, high, hangs, rays, light, waiting,
-                        )  # fmt: skip
+                    waiting = note_light(
+                        lanes_from(lone & ~whole & above_zero(rays, LITS), low, high), s, t, v * width + u1,
+                        scene.shape[2], hangs, rays, light, waiting,
+                    )  # fmt: skip
                     if waiting >= TOGETHER_LIGHT:
                         waiting = draw_light(
                             waiting, words, starts, last, shift, border, cap, outline, tile, u0, v0, later, view,
                             scene.shape[2], light, out,
                         )  # fmt: skip
-                    if tiny or outline[OUT_RIVALS] > 0:
+                    shared = lanes_from(shared, low, high)
+                    if shared:
                         slopes_of_row(tile, t, slopes)
                         made = own_of_row(
                             words, scene, starts, last, shift, border, s, u1, v, edge, hangs, tiny, caps, number,
-                            outlines, later, view, low, high, line, slopes, rays, beams, made, at, pixels, hidden,
-                            total, width, out,
+                            outlines, later, view, shared, line, slopes, rays, beams, made, at, pixels, hidden, total,
+                            width, out,
                         )  # fmt: skip
                     if every:
                         show_whole(every, words, starts, last, border, rays, places, parts)
@@ -231,38 +234,8 @@ def record_row(
 def desk() -> tuple[Any, ...]:
     """Room for what `frame` works on."""
     return (
-        np.zeros(PLANES * 64, np.float32), np.zeros(15, np.float32), np.zeros((5, 3, 3), np.float32),
-        np.zeros(12, np.float32), np.zeros(4, np.float32), np.zeros(64, np.uint32), np.zeros(PLANES * 64, np.float32),
-        np.zeros(TOGETHER, np.int64), np.zeros(TOGETHER, np.float32),
+        np.zeros(PLANES * 64, np.float32), np.zeros(POLYNOMIALS, np.float32), np.zeros((3, POLYNOMIALS), np.float32),
+        np.zeros(POLYNOMIALS, np.float32), np.zeros(4, np.float32), np.zeros(64, np.uint32),
+        np.zeros(PLANES * 64, np.float32), np.zeros(TOGETHER, np.int64), np.zeros(TOGETHER, np.float32),
         np.zeros(PLACES, np.uint32), np.zeros(PLACES, np.uint32), room_for_light(),
     )  # fmt: skip
-
-
-@fused_part
-def call_for(out: Any, width: Any, channels: Any, v: Any, stop: Any, u: Any, lanes: Any) -> None:
-    """Have a row's pixels, before `stop`, brought from memory."""
-    if v < stop:
-        first, line = np.uint64((v * width + u) * channels), np.uint64(64)
-        for k in range(first, first + np.uint64(lanes * channels), line):
-            to_write(out, k)
-
-
-@fused_part
-def write_bytes(out: Any, width: Any, of_pixel: Any, v: Any, u: Any, some: Any, rays: Any) -> None:
-    """Mix what lanes of a row show, some[0] to before some[1], with what is there, where a cap hides it."""
-    channels, three, block = np.uint64(of_pixel), np.uint64(3), np.uint64(32)
-    start, stop = np.uint64(some[0]), np.uint64(some[1])
-    first, last = np.uint64((v * width + u) * of_pixel), np.uint64((v + 1) * width * of_pixel)
-    if channels == three:
-        begin, count = three * start, (three * (stop - start) + block - np.uint64(1)) // block * block  # whole vectors
-        for j in range(start, start + (count + three - np.uint64(1)) // three, EIGHT):  # beyond the lanes, all is clear
-            thrice(rays, HIDDEN + j, COVER + three * j)
-        for k in range(begin, min(begin + count, last - first)):
-            value = rays[SHOWN + k] + (ONE - rays[COVER + k]) * np.float32(out[first + k]) + HALF
-            out[first + k] = np.uint8(np.int32(value if value < WHITE else WHITE))
-        return
-    for j in range(start, stop):
-        for channel in range(channels):
-            k, at = three * j + channel, first + j * channels + channel
-            value = rays[SHOWN + k] + (ONE - rays[HIDDEN + j]) * np.float32(out[at]) + HALF
-            out[at] = np.uint8(np.int32(value if value < WHITE else WHITE))

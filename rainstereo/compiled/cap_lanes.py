@@ -16,6 +16,8 @@ from numba.extending import intrinsic
 from .cap_vectors import REALS, WIDE, WORDS, folded
 from .llvm import FOUR, LONG, REAL, arguments, ir, load, spread, store
 
+POLYNOMIALS = 16
+"""Coefficients of a row: three for each of five polynomials along it, and one more that fills whole vectors."""
 SIDE = 4  # samples along a pixel's side where a cap hangs over
 declared: Any = vars(cgutils)["get_or_insert_function"]
 Number = Any  # Lanes, or a float that is the same in all of them
@@ -207,6 +209,24 @@ def _through_soft(
     return _loop(_arguments(rays, 4), _through_cap(True))
 
 
+def _row_of_tile(combined: Callable[[Lanes, Lanes, Lanes, Lanes], Lanes]) -> Any:
+    """A step (tile, line, t): all of a row's coefficients from those of its tile's three powers of t."""
+
+    @intrinsic
+    def step(_context: Any, tile: Any, line: Any, _t: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            powers, out, down = arguments(context, builder, signature, given)
+            t = Lanes.of(builder, down)
+            for first in range(0, POLYNOMIALS, WIDE):
+                parts = [Lanes.at(builder, powers, LONG(POLYNOMIALS * power + first)) for power in range(3)]
+                combined(t, *parts).put(out, LONG(first))
+            return context.get_dummy_value()
+
+        return types.void(tile, line, types.float32), code
+
+    return step
+
+
 @intrinsic
 def _taken_up(_context: Any, rays: Any, _first: Any, _last: Any, _to: Any, line: Any, _s: Any) -> Any:
     def body(builder: Any, data: Any, at: Any, put: Any, there: Any, line: Any, s: Lanes) -> None:
@@ -322,6 +342,10 @@ def _places_of(half: int) -> tuple[list[int], list[int]]:
     return [lane % SIDE for lane in range(WIDE)], [(WIDE * half + lane) // SIDE for lane in range(WIDE)]
 
 
+of_tile: Any = _row_of_tile(lambda t, a, b, c: a + t * (b + t * c))
+"""of_tile(tile, line, t): the polynomials of a row, t pixels from that which a tile's are about."""
+slopes_of_tile: Any = _row_of_tile(lambda t, a, b, c: b + (t + t) * c)
+"""slopes_of_tile(tile, slopes, t): how they change a pixel down."""
 taken_up: Any = _taken_up
 """taken_up(rays, first, last, 0, line, s): rays of lanes, from a row's polynomials, s + lane pixels along it."""
 with_room: Any = _with_room

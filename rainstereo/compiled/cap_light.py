@@ -18,11 +18,9 @@ from .cap_rays import (
     GAIN,
     HALF,
     HIDDEN,
-    MARK,
     ONE,
     PER,
     PLANES,
-    RIVAL,
     SHARE,
     STRETCH,
     SUB,
@@ -31,8 +29,8 @@ from .cap_rays import (
     ZERO,
     onward,
 )
-from .cap_tiles import LITS, OUT_X, OUT_Y, PARTLY
-from .cap_vectors import WIDE, above_zero, lanes_from, lowest
+from .cap_tiles import OUT_X, OUT_Y
+from .cap_vectors import WIDE, lowest
 from .compile import fused, fused_part
 from .prefetch import to_read
 
@@ -55,18 +53,14 @@ def _copy(noted: Any, k: Any, to: Any) -> None:
 
 @fused_part
 def note_light(
-    s: Any, t: Any, first: Any, channels: Any, low: Any, high: Any, hangs: bool, rays: Any, light: Any, count: Any
+    left: Any, s: Any, t: Any, first: Any, channels: Any, hangs: bool, rays: Any, light: Any, count: Any
 ) -> Any:  # fmt: skip
-    """Note those pixels of a row that need rays of their own and that no other cap shares, after `count` others on its
-    tile, and take them out of `HIDDEN`. Returns how many there are.
+    """Note pixels of a row, after `count` others on its tile, and take them out of `HIDDEN`. Returns how many there
+    are.
 
-    s, t: pixels from the tile's own to lane 0. first: number of its pixel.
+    left: which, as bits. s, t: pixels from the tile's own to lane 0. first: number of its pixel.
     """
     noted, pixels = light[1], light[2]
-    for j in range(np.uint64(64)):
-        own = rays[HIDDEN + j] if rays[LITS + j] == PARTLY else ZERO
-        rays[MARK + j] = ZERO if rays[RIVAL + j] > ZERO else own
-    left = lanes_from(above_zero(rays, MARK), low, high)
     while left:
         j = lowest(left)
         left &= left - np.uint64(1)

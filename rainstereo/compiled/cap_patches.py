@@ -14,9 +14,9 @@ from numba.extending import intrinsic
 
 from .cap_lanes import Lanes
 from .cap_looks import BIAS, EDGE, EIGHTHS, INSIDE, MIRROR
-from .cap_rays import HIDDEN, MARK, PATCH, RIVAL, SHOWN, ZERO
-from .cap_tiles import ACROSS, DOWN, FAR, GAINS, LITS, SIZE, WHOLE
-from .cap_vectors import REALS, WIDE, WORDS, above, above_zero, folded, lanes_from, lowest, pairs_times
+from .cap_rays import HIDDEN, PATCH, SHOWN
+from .cap_tiles import ACROSS, DOWN, FAR, GAINS, SIZE
+from .cap_vectors import REALS, WIDE, WORDS, above, folded, lowest, pairs_times
 from .compile import fused_part
 from .llvm import BYTE, FOUR, LONG, REAL, TWO, alike, arguments, ir, load, spread, store
 from .prefetch import call
@@ -228,15 +228,6 @@ def _folded(at: Lanes, last: Lanes, border: int) -> Lanes:
 
 _inside, _at_edge, _mirrored = (_placed(border) for border in (INSIDE, EDGE, MIRROR))
 _sum: Any = _summed
-
-
-@fused_part
-def whole_of_row(low: Any, high: Any, rays: Any) -> Any:
-    """Which pixels of a row are shown as patches, lanes low to before high, as bits."""
-    for each in range(np.uint64(64)):
-        whole = rays[HIDDEN + each] if rays[LITS + each] == WHOLE else ZERO
-        rays[MARK + each] = ZERO if rays[RIVAL + each] > ZERO else whole
-    return lanes_from(above_zero(rays, MARK), low, high)
 
 
 @fused_part

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .cap_lanes import taken_up, through_hard, through_soft, to_scene, with_room
+from .cap_lanes import POLYNOMIALS, of_tile, taken_up, through_hard, through_soft, to_scene, with_room
 from .compile import fused_part
 
 PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
@@ -25,8 +25,8 @@ SUB = np.uint64(64 * 20)  # of one pixel
 PATCH = np.uint64(64 * 23)
 HIDDEN, RIVAL = (np.uint64(64 * i) for i in (43, 44))
 """Of a row: the share of each pixel that a cap hides; and 1 + the number of another that shows some of it, or 0."""
-SHOWN, COVER = np.uint64(64 * 45), np.uint64(64 * 48)
-"""What a row shows, three channels a pixel, and the share that is hidden, thrice."""
+SHOWN = np.uint64(64 * 45)
+"""What a row shows, three channels a pixel."""
 WEIGHT, STRETCH = np.uint64(64 * 51), np.uint64(64 * 52)
 SPREAD, PER = np.uint64(64 * 53), np.uint64(64 * 54)
 """Of a pixel's own rays: see `cross`, and how a box's size follows from how far a ray looks (`cap_edges`)."""
@@ -56,38 +56,35 @@ EIGHT = np.uint64(8)
 def fit(nodes: Any, cap: Any, u: Any, v: Any, reach: Any, tile: Any) -> Any:
     """Polynomials of x, y, kx, ky and dimming over a tile, (5, 3, 3) float32, and the pixel that they are about.
 
-    nodes: (4 + D, h, w) float64. u, v: the tile's middle; reach: pixels from there to its sides.
+    nodes: (h, w, 4 + D) float64. u, v: the tile's middle; reach: pixels from there to its sides.
     """
-    most = max(min((nodes.shape[2] - 1) // 2, (nodes.shape[1] - 1) // 2), 1)
+    height, width = nodes.shape[0], nodes.shape[1]
+    most = max(min((width - 1) // 2, (height - 1) // 2), 1)
     step = min(max(int(0.87 * reach / STEP + 0.5), 1), most)  # about where the error is least
-    i = min(max((u + STEP // 2) // STEP, step), nodes.shape[2] - 1 - step)
-    j = min(max((v + STEP // 2) // STEP, step), nodes.shape[1] - 1 - step)
+    i = min(max((u + STEP // 2) // STEP, step), width - 1 - step)
+    j = min(max((v + STEP // 2) // STEP, step), height - 1 - step)
     scale = 1.0 / (STEP * step)
-    for plane in range(5):
-        source = plane if plane < 4 else 4 + int(cap[CAP_DIM])
-        base = cap[CAP_X] if plane == X_NODE else cap[CAP_Y] if plane == Y_NODE else 0.0
-        for row in range(3):
-            line = j + (row - 1) * step
-            a = nodes[source, line, i - step] - base
-            b = nodes[source, line, i] - base
-            c = nodes[source, line, i + step] - base
-            tile[plane, row, 0] = np.float32(b)
-            tile[plane, row, 1] = np.float32(0.5 * (c - a) * scale)
-            tile[plane, row, 2] = np.float32(0.5 * (a + c - 2 * b) * scale * scale)
-        for power in range(3):
-            a, b, c = tile[plane, 0, power], tile[plane, 1, power], tile[plane, 2, power]
-            tile[plane, 0, power] = b
-            tile[plane, 1, power] = np.float32(0.5 * (c - a) * scale)
-            tile[plane, 2, power] = np.float32(0.5 * (a + c - b - b) * scale * scale)
+    for row in range(3):
+        line = nodes[j + (row - 1) * step]
+        for plane in range(5):
+            source = plane if plane < 4 else 4 + int(cap[CAP_DIM])
+            base = cap[CAP_X] if plane == X_NODE else cap[CAP_Y] if plane == Y_NODE else 0.0
+            a, b, c = line[i - step, source] - base, line[i, source] - base, line[i + step, source] - base
+            tile[row, 3 * plane] = np.float32(b)
+            tile[row, 3 * plane + 1] = np.float32(0.5 * (c - a) * scale)
+            tile[row, 3 * plane + 2] = np.float32(0.5 * (a + c - 2 * b) * scale * scale)
+    for k in range(POLYNOMIALS):
+        a, b, c = tile[0, k], tile[1, k], tile[2, k]
+        tile[0, k] = b
+        tile[1, k] = np.float32(0.5 * (c - a) * scale)
+        tile[2, k] = np.float32(0.5 * (a + c - b - b) * scale * scale)
     return np.float32(i * STEP), np.float32(j * STEP)
 
 
 @fused_part
 def of_row(tile: Any, t: Any, line: Any) -> None:
-    """The polynomials, (15,), of a row, t pixels from that which a tile's are about."""
-    for plane in range(5):
-        for power in range(3):
-            line[3 * plane + power] = tile[plane, 0, power] + t * (tile[plane, 1, power] + t * tile[plane, 2, power])
+    """The polynomials, (`POLYNOMIALS`,), of a row, t pixels from that which a tile's are about."""
+    of_tile(tile, line, np.float32(t))
 
 
 @fused_part

@@ -22,14 +22,11 @@ from .cap_rays import (
     CAP_SQUARE,
     GAIN,
     HALF,
-    KX,
-    KY,
     MARK,
     NEXT,
     OWN,
     PATCH,
     PX,
-    PY,
     ROOM,
     Y_,
     ZERO,
@@ -80,7 +77,7 @@ def bounds(outline: Any, width: Any, height: Any) -> Any:
 @fused_part
 def widest(tile: Any) -> Any:
     """How far apart rays that are a pixel apart meet the face, metres, at most: the larger singular value."""
-    xu, xv, yu, yv = tile[0, 0, 1], tile[0, 1, 0], tile[1, 0, 1], tile[1, 1, 0]
+    xu, xv, yu, yv = tile[0, 1], tile[1, 0], tile[0, 4], tile[1, 3]
     total, area = xu * xu + xv * xv + yu * yu + yv * yv, 2 * (xu * yv - xv * yu)
     return 1.02 * math.sqrt(0.5 * (total + math.sqrt(max(total * total - area * area, 0.0))))
 
@@ -88,8 +85,8 @@ def widest(tile: Any) -> Any:
 @fused_part
 def hangs_over(tile: Any, cap: Any, wide: Any, reach: Any) -> Any:
     """Whether rays beside a cap may run into its side."""
-    kx = abs(tile[2, 0, 0]) + reach * (abs(tile[2, 0, 1]) + abs(tile[2, 1, 0]))
-    ky = abs(tile[3, 0, 0]) + reach * (abs(tile[3, 0, 1]) + abs(tile[3, 1, 0]))
+    kx = abs(tile[0, 6]) + reach * (abs(tile[0, 7]) + abs(tile[1, 6]))
+    ky = abs(tile[0, 9]) + reach * (abs(tile[0, 10]) + abs(tile[1, 9]))
     square = kx * kx + ky * ky
     out = math.sqrt(cap[CAP_SQUARE]) + 2 * wide
     return math.sqrt(square) * out > math.sqrt(max(1 - square, 0.0)) * cap[CAP_DEPTH]
@@ -267,23 +264,23 @@ def move_up(rays: Any) -> None:
 @fused_part
 def value_on(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     """A tile's polynomial, t and s pixels from its own."""
-    a = tile[plane, 0, 0] + t * (tile[plane, 1, 0] + t * tile[plane, 2, 0])
-    b = tile[plane, 0, 1] + t * (tile[plane, 1, 1] + t * tile[plane, 2, 1])
-    c = tile[plane, 0, 2] + t * (tile[plane, 1, 2] + t * tile[plane, 2, 2])
+    a = tile[0, 3 * plane] + t * (tile[1, 3 * plane] + t * tile[2, 3 * plane])
+    b = tile[0, 3 * plane + 1] + t * (tile[1, 3 * plane + 1] + t * tile[2, 3 * plane + 1])
+    c = tile[0, 3 * plane + 2] + t * (tile[1, 3 * plane + 2] + t * tile[2, 3 * plane + 2])
     return a + s * (b + s * c)
 
 
 @fused_part
 def along(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     """How it changes a pixel along a row."""
-    b = tile[plane, 0, 1] + t * (tile[plane, 1, 1] + t * tile[plane, 2, 1])
-    c = tile[plane, 0, 2] + t * (tile[plane, 1, 2] + t * tile[plane, 2, 2])
+    b = tile[0, 3 * plane + 1] + t * (tile[1, 3 * plane + 1] + t * tile[2, 3 * plane + 1])
+    c = tile[0, 3 * plane + 2] + t * (tile[1, 3 * plane + 2] + t * tile[2, 3 * plane + 2])
     return b + (s + s) * c
 
 
 @fused_part
 def down(tile: Any, plane: Any, t: Any, s: Any) -> Any:
     """How it changes a pixel down."""
-    b = tile[plane, 1, 0] + s * (tile[plane, 1, 1] + s * tile[plane, 1, 2])
-    c = tile[plane, 2, 0] + s * (tile[plane, 2, 1] + s * tile[plane, 2, 2])
+    b = tile[1, 3 * plane] + s * (tile[1, 3 * plane + 1] + s * tile[1, 3 * plane + 2])
+    c = tile[2, 3 * plane] + s * (tile[2, 3 * plane + 1] + s * tile[2, 3 * plane + 2])
     return b + (t + t) * c

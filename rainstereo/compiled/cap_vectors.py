@@ -14,7 +14,7 @@ from numba.extending import intrinsic
 
 from .boxes import BITS
 from .compile import fused_part
-from .llvm import FOUR, LONG, REAL, alike, arguments, ir, load, spread, store
+from .llvm import FOUR, LONG, REAL, alike, arguments, ir, load, spread
 
 WIDE = 8
 get_or_insert_function: Any = vars(cgutils)["get_or_insert_function"]
@@ -104,22 +104,6 @@ def _highest(_context: Any, _bits: Any) -> Any:
 
 
 @intrinsic
-def _thrice(_context: Any, rays: Any, _source: Any, _to: Any) -> Any:
-    """thrice(rays, source, to): write each of 8 numbers three times, side by side, `to` on."""
-
-    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        data, source, to = arguments(context, builder, signature, given)
-        values = load(builder, data, source, REALS)
-        nothing = ir.Constant(REALS, ir.Undefined)
-        for part in range(3):
-            which = ir.Constant(WORDS, [(WIDE * part + lane) // 3 for lane in range(WIDE)])
-            store(builder, builder.shuffle_vector(values, nothing, which), data, builder.add(to, LONG(WIDE * part)))
-        return context.get_dummy_value()
-
-    return types.void(rays, types.uint64, types.uint64), code
-
-
-@intrinsic
 def _sum_of_16(_context: Any, rays: Any, _first: Any) -> Any:
     """sum_of_16(rays, first): of sixteen numbers."""
 
@@ -160,7 +144,6 @@ def _weighed(_context: Any, words: Any, at: Any, _first: Any, rays: Any, _weight
 above: Any = _above
 lowest: Any = _lowest
 highest: Any = _highest
-thrice: Any = _thrice
 sum_of_16: Any = _sum_of_16
 weighed: Any = _weighed
 

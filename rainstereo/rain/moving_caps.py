@@ -45,7 +45,7 @@ FEW = 1500  # caps, up to which all pairs are compared
 class FaceLattice:
     """Where rays of the camera meet a panel's far face, every few pixels; and what is behind it.
 
-    nodes: (4, h, w) float64: x, y in metres of the panel frame, and the transverse wave vector; of pixels 0, STEP, ...
+    nodes: (h, w, 4) float64: x, y in metres of the panel frame, and the transverse wave vector; of pixels 0, STEP, ...
     later, view: see `compiled.cap_rays`. origin: of the face's coordinates. index: the panel's.
     """
 
@@ -62,7 +62,7 @@ class FaceLattice:
         columns, rows = (STEP * np.arange(max(-(-(n - 1) // STEP), 2) + 1.0) for n in camera.size)
         rays = backproject(np.stack(np.meshgrid(columns, rows), -1), camera, chamber, 2 * panel + 2)
         points, waves = (part @ frame.R_panel_cam.T for part in (rays.origins, rays.directions))
-        nodes = np.stack([points[..., 0], points[..., 1], waves[..., 0], waves[..., 1]])
+        nodes = np.concatenate([points[..., :2], waves[..., :2]], -1)
         later, end = _behind(chamber, panel)
         view: Image = _view(camera, frame, end, depth).astype(np.float32)
         return cls(nodes, later, view, frame.origin(chamber, panel), float(chamber.panels[panel].index))
@@ -75,7 +75,7 @@ class FaceLattice:
     def dimming(self, index: float) -> Array:
         """What enters drops of an index, over what reaches the scene through the bare panels, at each node."""
         with np.errstate(invalid="ignore"):
-            square = np.square(self.nodes[2]) + np.square(self.nodes[3])
+            square = np.square(self.nodes[..., 2:]).sum(-1)
             panel, drop, air = (np.sqrt(n * n - square) for n in (self.index, index, 1.0))
             bare = fresnel.transmittance(panel, air, self.index, 1.0)
             for _, before, behind in self.later.astype(np.float64):
@@ -124,8 +124,8 @@ class CapScene:
         """The lattice, and how drops of each index dim."""
         if indices not in self._nodes:
             self._nodes.clear()
-            dimming = [self.lattice.dimming(index)[None] for index in indices]
-            self._nodes[indices] = np.concatenate([self.lattice.nodes, *dimming])
+            dimming = [self.lattice.dimming(index)[..., None] for index in indices]
+            self._nodes[indices] = np.concatenate([self.lattice.nodes, *dimming], -1)
         return self._nodes[indices]
 
     @cached_property

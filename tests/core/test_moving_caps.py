@@ -45,6 +45,7 @@ def scene_of(camera: Camera, chamber: Chamber, depth: float) -> CapScene:
 )
 def test_rays_of_a_tile_are_those_of_the_tracer(view, place, radius, angle):
     """In ten-thousandths of a pixel of the frame, where the lens does not bend the lattice much."""
+    from rainstereo.compiled.cap_lanes import POLYNOMIALS
     from rainstereo.compiled.cap_rays import GAIN, OWN, PLANES, Y_, cross, fit, of_row, take_up
 
     camera, chamber, depth = VIEWS[view]
@@ -53,7 +54,7 @@ def test_rays_of_a_tile_are_those_of_the_tracer(view, place, radius, angle):
     outlines = Outlines.of([drop], camera, chamber)
     table = CapTable.of(scene, [drop], np.zeros(1, np.intp))
     u, v = int(outlines.x[0]), int(outlines.y[0])
-    tile, line = np.zeros((5, 3, 3), np.float32), np.zeros(15, np.float32)
+    tile, line = np.zeros((3, POLYNOMIALS), np.float32), np.zeros(POLYNOMIALS, np.float32)
     rays = np.zeros(PLANES * 64, np.float32)
     u0, v0 = fit(table.nodes, table.columns[0], u, v, 20, tile)
     planes = rays.reshape(-1, 64)
@@ -171,11 +172,12 @@ class OwnRays:
     """The rays of single pixels of one cap, as `compiled.cap_edges` traces them, and as `compiled.cap_light` does."""
 
     def __init__(self, drop: SphericalCap) -> None:
+        from rainstereo.compiled.cap_lanes import POLYNOMIALS
         from rainstereo.compiled.cap_light import room_for_light
         from rainstereo.compiled.cap_rays import PLANES, fit
 
         self.table = CapTable.of(scene_of(CAMERA, PANE, math.inf), [drop], np.zeros(1, np.intp))
-        self.tile, self.rays = np.zeros((5, 3, 3), np.float32), np.zeros(PLANES * 64, np.float32)
+        self.tile, self.rays = np.zeros((3, POLYNOMIALS), np.float32), np.zeros(PLANES * 64, np.float32)
         self.beams, self.noted, *_ = room_for_light()
         self.outline = self.table.outlines[0]
         self.middle = round(float(self.outline[0])), round(float(self.outline[1]))
@@ -184,9 +186,10 @@ class OwnRays:
     def one_by_one(self, u: int, v: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Places, (RAYS, 2), and weights, (RAYS,), and the share of the pixel that the cap hides."""
         from rainstereo.compiled.cap_edges import RAYS, form_of, set_out, slopes_of_row, trace_own
+        from rainstereo.compiled.cap_lanes import POLYNOMIALS
         from rainstereo.compiled.cap_rays import SUB, WEIGHT, Y_, of_row
 
-        line, slopes = np.zeros(15, np.float32), np.zeros(12, np.float32)
+        line, slopes = np.zeros((2, POLYNOMIALS), np.float32)
         t, s = np.float32(v - self.origin[1]), np.float32(u - self.origin[0])
         of_row(self.tile, t, line)
         slopes_of_row(self.tile, t, slopes)
