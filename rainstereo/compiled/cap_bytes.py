@@ -10,12 +10,12 @@ from numba.extending import intrinsic
 
 from .cap_lanes import Lanes
 from .cap_rays import HALF, HIDDEN, ONE, SHOWN
-from .cap_vectors import REALS, WIDE, WORDS
+from .cap_vectors import EIGHT, REALS, WIDE, WORDS
 from .compile import fused_part
 from .llvm import BYTE, LONG, arguments, ir, load, store
 from .prefetch import to_write
 
-EIGHT, THREE, WHITE = np.uint64(WIDE), np.uint64(3), np.float32(255)
+THREE, WHITE = np.uint64(3), np.float32(255)
 BYTES = ir.VectorType(BYTE, WIDE)
 
 
@@ -29,8 +29,8 @@ def call_for(out: Any, width: Any, channels: Any, v: Any, stop: Any, u: Any, lan
 
 
 @intrinsic
-def _mix(_context: Any, rays: Any, _lane: Any, out: Any, _first: Any) -> Any:
-    """mix(rays, lane, out, first): what eight pixels of three channels show with what is there, from `first` on."""
+def _mix_eight(_context: Any, rays: Any, _lane: Any, out: Any, _first: Any) -> Any:
+    """mix_eight(rays, lane, out, first): what eight pixels of three channels show, with what is there, `first` on."""
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         data, lane, frame, first = arguments(context, builder, signature, given)
@@ -49,6 +49,9 @@ def _mix(_context: Any, rays: Any, _lane: Any, out: Any, _first: Any) -> Any:
     return types.void(rays, types.uint64, out, types.uint64), code
 
 
+mix_eight: Any = _mix_eight
+
+
 @fused_part
 def write_bytes(out: Any, width: Any, of_pixel: Any, v: Any, u: Any, some: Any, rays: Any) -> None:
     """Mix what lanes of a row show, some[0] to before some[1], with what is there, where a cap hides it."""
@@ -56,10 +59,19 @@ def write_bytes(out: Any, width: Any, of_pixel: Any, v: Any, u: Any, some: Any, 
     first = np.uint64((v * width + u) * of_pixel)
     if channels == THREE:
         while start < stop and start + EIGHT <= np.uint64(width - u):  # beyond the lanes, all is clear
-            _mix(rays, start, out, first + THREE * start)
+            mix_eight(rays, start, out, first + THREE * start)
             start += EIGHT
     for j in range(start, stop):
         for channel in range(channels):
             k, at = THREE * j + channel, first + j * channels + channel
             value = rays[SHOWN + k] + (ONE - rays[HIDDEN + j]) * np.float32(out[at]) + HALF
             out[at] = np.uint8(np.int32(value if value < WHITE else WHITE))
+
+
+@fused_part
+def mix(out: Any, first: Any, channels: Any, shown: Any, hidden: Any) -> None:
+    """Mix what a pixel shows, its first byte at `first`, with what is there, where a cap hides it."""
+    for channel in range(np.uint64(channels)):
+        k = np.uint64(first) + channel
+        value = shown[channel] + (ONE - hidden) * np.float32(out[k]) + HALF
+        out[k] = np.uint8(np.int32(value if value < WHITE else WHITE))

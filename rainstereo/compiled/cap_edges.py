@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from .cap_bytes import mix
 from .cap_lanes import slopes_of_tile
 from .cap_looks import BIAS, folded, pixel_value
 from .cap_rays import (
@@ -60,7 +61,6 @@ WIDER = np.float32(1.8)
 """Area of a box over that of the part of a patch that a ray stands for."""
 SOFTEST = np.float32(1e-3)  # less is lost in rounding
 NOWHERE = np.uint32((1 << 32) - 1)
-WHITE = np.float32(255)
 SIZE_BITS, NO_BOX = 27, 31
 SIZE_SHIFT, REST, NO_SIZE = np.uint32(SIZE_BITS), np.uint32((1 << SIZE_BITS) - 1), np.uint32(NO_BOX)
 """From which bit on a box's number holds its size; and the size that is the image itself."""
@@ -259,15 +259,6 @@ def add_rays(words: Any, scene: Any, alone: bool, rays: Any, first: Any, at: Any
     shown[0] += red - boxed
     shown[1] += green - boxed
     shown[2] += blue - boxed
-
-
-@fused_part
-def mix(out: Any, first: Any, channels: Any, shown: Any, hidden: Any) -> None:
-    """Mix what a pixel shows, its first byte at `first`, with what is there, where a cap hides it."""
-    for channel in range(np.uint64(channels)):
-        k = np.uint64(first) + channel
-        value = shown[channel] + (ONE - hidden) * np.float32(out[k]) + HALF
-        out[k] = np.uint8(np.int32(value if value < WHITE else WHITE))
 
 
 @fused

@@ -129,8 +129,8 @@ def _on_line(builder: Any, line: Any, lane: Any, s: Lanes, planes: int) -> list[
     return [c[3 * k] + at * (c[3 * k + 1] + at * c[3 * k + 2]) for k in range(planes)]
 
 
-def _arguments(rays: Any, count: int) -> Any:
-    return types.void(rays, types.uint64, types.uint64, types.uint64, *[types.float32] * count)
+def _arguments(rays: Any, count: int, *others: Any) -> Any:
+    return types.void(rays, types.uint64, types.uint64, types.uint64, *others, *[types.float32] * count)
 
 
 def of_light(inside: Lanes, spread: Lanes, per: Lanes) -> tuple[Lanes, Lanes]:
@@ -237,8 +237,7 @@ def _taken_up(_context: Any, rays: Any, _first: Any, _last: Any, _to: Any, line:
         put(KY, ky)
         put(DIM, dim)
 
-    long = types.uint64
-    return _loop(types.void(rays, long, long, long, line, types.float32), body)
+    return _loop(_arguments(rays, 1, line), body)
 
 
 @intrinsic
@@ -247,8 +246,7 @@ def _with_room(_context: Any, rays: Any, _first: Any, _last: Any, _to: Any, line
         x, y = _on_line(builder, line, there(0), s, 2)
         put(NEXT, square - x * x - y * y)
 
-    long, real = types.uint64, types.float32
-    return _loop(types.void(rays, long, long, long, line, real, real), body)
+    return _loop(_arguments(rays, 2, line), body)
 
 
 @intrinsic
@@ -281,8 +279,7 @@ def _lit_of(
             least, most = least.where(gain.above(least), gain), most.where(most.above(gain), gain)
         put(LITS, whole.where(least.above(0.0), partly.where(most.above(0.0))))
 
-    long, real = types.uint64, types.float32
-    return _loop(types.void(rays, long, long, long, long, long, real, real), body)
+    return _loop(_arguments(rays, 2, above, below), body)
 
 
 def _to_scene(

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from .cap_beams import BEAMS, HALVES, NOTED, TOGETHER, summed, traced
-from .cap_edges import NO_SIZE, RAYS, REST, SIZE_SHIFT, WHITE, box_of, boxes_of_rays
+from .cap_bytes import WHITE
+from .cap_edges import NO_SIZE, RAYS, REST, SIZE_SHIFT, box_of, boxes_of_rays
 from .cap_rays import (
     CAP_CURVATURE,
     CAP_DEPTH,
@@ -30,11 +31,10 @@ from .cap_rays import (
     onward,
 )
 from .cap_tiles import OUT_X, OUT_Y
-from .cap_vectors import WIDE, lowest
+from .cap_vectors import EIGHT, WIDE, lowest
 from .compile import fused, fused_part
 from .prefetch import to_read
 
-EIGHT = np.uint64(WIDE)
 PLACE, PLACE_DOWN, SHARE_HIDDEN, HANGS, UNIT = (NOTED * k for k in range(5))
 """Planes of what is noted: see `cap_beams.traced`."""
 

@@ -16,12 +16,12 @@ from .cap_lanes import Lanes
 from .cap_looks import BIAS, EDGE, EIGHTHS, INSIDE, MIRROR
 from .cap_rays import HIDDEN, PATCH, SHOWN
 from .cap_tiles import ACROSS, DOWN, FAR, GAINS, SIZE
-from .cap_vectors import REALS, WIDE, WORDS, above, folded, lowest, pairs_times
+from .cap_vectors import EIGHT, REALS, WIDE, WORDS, above, folded, lowest, pairs_times
 from .compile import fused_part
 from .llvm import BYTE, FOUR, LONG, REAL, TWO, alike, arguments, ir, load, spread, store
 from .prefetch import call
 
-EIGHT, LANES = np.uint64(WIDE), np.uint64(0xFF)
+LANES = np.uint64(0xFF)
 MOST = 64  # looks a pixel
 PLACES = MOST * WIDE  # of the boxes of eight pixels
 room_for: Any = vars(cgutils)["alloca_once"]

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from .cap_lanes import POLYNOMIALS, of_tile, taken_up, through_hard, through_soft, to_scene, with_room
+from .cap_vectors import EIGHT
 from .compile import fused_part
 
 PX, PY, KX, KY, KZ, DIM, RISE, SHARE, ROOM, NEXT, FREE = (np.uint64(64 * i) for i in range(11))
@@ -49,13 +50,13 @@ which the lens model folds back; fx, fy and its coefficients, OpenCV's first 12 
 
 STEP = 8  # pixels between nodes
 X_NODE, Y_NODE, KX_NODE, KY_NODE, DIM_NODE = range(5)
-EIGHT = np.uint64(8)
 
 
 @fused_part
 def fit(nodes: Any, cap: Any, u: Any, v: Any, reach: Any, tile: Any) -> Any:
-    """Polynomials of x, y, kx, ky and dimming over a tile, (5, 3, 3) float32, and the pixel that they are about.
+    """Polynomials of x, y, kx, ky and dimming over a tile, and the pixel that they are about.
 
+    tile: (3, `POLYNOMIALS`) float32, a row for each power down the tile, of one after the other's powers along it.
     nodes: (h, w, 4 + D) float64. u, v: the tile's middle; reach: pixels from there to its sides.
     """
     height, width = nodes.shape[0], nodes.shape[1]

@@ -34,7 +34,7 @@ from .cap_rays import (
     take_up,
 )
 from .cap_tiles import OUT_RADIUS, OUT_RIVAL, OUT_RIVALS, OUT_X, OUT_Y, along, down, value_on
-from .cap_vectors import above, above_zero, ends, lanes_from, lowest
+from .cap_vectors import EIGHT, above, above_zero, ends, lanes_from, lowest
 from .compile import fused, fused_part
 
 SAGITTA = np.float32(1.1 / 24)
@@ -43,7 +43,6 @@ pixel are somewhat longer than its side."""
 FAR_LESS = np.float32(1e9)  # room: none at all
 FEW = 24  # lanes all of whose shares are computed
 ALIKE = 1e-6  # of a cap's room: less of a difference is rounding
-EIGHT = np.uint64(8)
 
 
 @fused_part
@@ -98,10 +97,8 @@ def contacts(
     the row; edge: see `shares_of_row`."""
     radius, two = np.float32(math.sqrt(cap[CAP_SQUARE])), t + t
     x0, x1, x2, y0, y1, y2 = line[0], line[1], line[2], line[3], line[4], line[5]
-    a0, a1, a2 = (tile[1, 0] + two * tile[2, 0], tile[1, 1] + two * tile[2, 1],
-                  tile[1, 2] + two * tile[2, 2])  # fmt: skip
-    b0, b1, b2 = (tile[1, 3] + two * tile[2, 3], tile[1, 4] + two * tile[2, 4],
-                  tile[1, 5] + two * tile[2, 5])  # fmt: skip
+    a0, a1, a2 = tile[1, 0] + two * tile[2, 0], tile[1, 1] + two * tile[2, 1], tile[1, 2] + two * tile[2, 2]
+    b0, b1, b2 = tile[1, 3] + two * tile[2, 3], tile[1, 4] + two * tile[2, 4], tile[1, 5] + two * tile[2, 5]
     for block in range(np.uint64(low), np.uint64(high), EIGHT):
         for lane in range(EIGHT):
             j = block + lane
@@ -155,13 +152,10 @@ def _by_sides(tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, cap: 
             j = block + lane
             px, py, kx, ky = rays[PX + j], rays[PY + j], rays[KX + j], rays[KY + j]
             kz = np.float32(math.sqrt(ONE - kx * kx - ky * ky))
-            b = (
-                px * kx + py * ky + kz * depth
-            )  # what the ray has to go yet to where it is closest to the sphere's centre
+            b = px * kx + py * ky + kz * depth  # what the ray has to go yet, where it is closest to the sphere's centre
             gx, gy, r2 = b * kx - px, b * ky - py, px * px + py * py
-            past = -broad * (
-                two * np.float32(math.sqrt(gx * gx + gy * gy)) + broad
-            )  # more than a pixel beside the sphere
+            beside = np.float32(math.sqrt(gx * gx + gy * gy))
+            past = -broad * (two * beside + broad)  # more than a pixel beside the sphere
             meets = ONE if b * b + square - r2 >= past else ZERO
             meets = ONE if r2 <= out else meets
             meets = meets if b < near else ZERO  # only before it can it meet the side

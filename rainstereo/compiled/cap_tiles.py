@@ -35,7 +35,7 @@ from .cap_rays import (
     room_of_row,
     take_up,
 )  # fmt: skip
-from .cap_vectors import above, ends, lanes_from
+from .cap_vectors import EIGHT, above, ends, lanes_from
 from .compile import fused_part
 
 NEARLY = np.float32(1e-5)  # of the square of an index: what rounding may hide
@@ -60,7 +60,6 @@ LARGEST = np.float32(120 * 120)
 """Area, square pixels, beyond which a patch is bent too much for a quadratic: its pixel has rays of its own."""
 LARGEST_ALONE = np.float32(80 * 80)
 """The same where a neighbour's middle is dark, so that it is less sure how the patch is bent."""
-EIGHT = np.uint64(8)
 
 
 @fused_part

@@ -17,6 +17,10 @@ from .compile import fused_part
 from .llvm import FOUR, LONG, REAL, alike, arguments, ir, load, spread
 
 WIDE = 8
+EIGHT = np.uint64(WIDE)
+"""Loops over lanes go eight by eight, with an inner loop of just that length: of each of its lines the compiler makes
+one vector, and nothing for lanes that are left, on which rows of a few pixels would else spend their time. Short bodies
+it would write out eight times instead: those are in its own language (`cap_lanes`)."""
 get_or_insert_function: Any = vars(cgutils)["get_or_insert_function"]
 WORDS, REALS = ir.VectorType(FOUR, WIDE), ir.VectorType(REAL, WIDE)
 FIELD = (1 << BITS) - 1

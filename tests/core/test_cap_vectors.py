@@ -173,7 +173,7 @@ def test_what_is_beside_the_light_stays_dark():
 
 
 @needs_numba
-def test_lanes_are_found_by_bits_and_written_thrice():
+def test_lanes_are_found_by_bits_and_summed():
     from rainstereo.compiled import cap_vectors
     from rainstereo.compiled.compile import fused_part
 
@@ -187,9 +187,8 @@ def test_lanes_are_found_by_bits_and_written_thrice():
         return count
 
     @fused_part
-    def copied(rays, source, to):
-        cap_vectors.thrice(rays, source, to)
-        return cap_vectors.sum_of_16(rays, to)
+    def summed(rays, first):
+        return cap_vectors.sum_of_16(rays, first)
 
     rng = np.random.default_rng(1)
     rays = np.concatenate([np.ones(16), rng.uniform(-1, 1, 64), np.ones(48)]).astype(np.float32)
@@ -199,11 +198,65 @@ def test_lanes_are_found_by_bits_and_written_thrice():
         count = lanes(rays, low, high, found)
         expected = low + np.flatnonzero(rays[16 + low : 16 + max(low, high)] > 0)
         np.testing.assert_array_equal(found[:count], expected)
-    rays[21] = 0.5
-    total = copied(rays, np.uint64(16), np.uint64(90))
-    np.testing.assert_array_equal(rays[90:114], np.repeat(rays[16:24], 3))
-    assert rays[114] == 1.0
-    assert total == pytest.approx(rays[90:106].sum(), rel=1e-6)
+    assert summed(rays, np.uint64(37)) == pytest.approx(rays[37:53].sum(), rel=1e-6)
+
+
+@needs_numba
+@pytest.mark.parametrize("channels", [3, 2, 1])
+def test_rows_are_mixed_into_bytes(channels):
+    """Only the lanes asked for, also where the frame ends beside them, up to white."""
+    from rainstereo.compiled import cap_bytes, cap_rays
+
+    rng, width, v = np.random.default_rng(channels), 61, 1
+    rays = np.zeros((cap_rays.PLANES, 64), np.float32)
+    hidden = rays[int(cap_rays.HIDDEN) // 64]
+    shown = rays[int(cap_rays.SHOWN) // 64 :][:3].reshape(64, 3)
+    for first, stop, u in ((0, 21, 0), (8, 40, 3), (0, 5, 56), (16, 29, 32), (0, 56, 5)):
+        hidden[:], shown[:] = 0, 0
+        lanes = slice(first, stop)
+        hidden[lanes] = rng.choice([0.0, 0.25, 0.7, 1.0], stop - first)
+        shown[lanes, :channels] = hidden[lanes, None] * rng.uniform(0, 290, (stop - first, channels))
+        out = rng.integers(0, 256, (3, width, channels)).astype(np.uint8)
+        expected = out.astype(np.float64)
+        expected[v, u + first : u + stop] *= 1 - hidden[lanes, None]
+        expected[v, u + first : u + stop] += shown[lanes, :channels]
+        found = out.copy()
+        cap_bytes.write_bytes(found.reshape(-1), width, channels, v, u, (first, stop), rays.reshape(-1))
+        assert (np.abs(found - np.minimum(expected, 255)) <= 0.5001).all()
+        untouched = np.ones(out.shape[:2], dtype=bool)
+        untouched[v, u + first : u + stop] = False
+        np.testing.assert_array_equal(found[untouched], out[untouched])
+
+
+@needs_numba
+def test_rows_of_a_tile_are_polynomials_and_their_slopes():
+    from rainstereo.compiled import cap_lanes, cap_rays, cap_tiles
+    from rainstereo.compiled.cap_edges import slopes_of_row
+
+    rng, lanes, s, t = np.random.default_rng(5), np.arange(24), np.float32(-7.5), np.float32(3.25)
+    tile = rng.uniform(-1, 1, (3, cap_lanes.POLYNOMIALS)).astype(np.float32)
+    line, slopes = np.zeros((2, cap_lanes.POLYNOMIALS), np.float32)
+    rays = np.zeros((cap_rays.PLANES, 64), np.float32)
+    cap_rays.of_row(tile, t, line)
+    slopes_of_row(tile, t, slopes)
+    cap_rays.take_up(line, s, 0, 24, rays.reshape(-1))
+    cap_rays.room_of_row(line, s, 24, np.float32(9), rays.reshape(-1))
+    at = np.full(24, float(t)), lanes + float(s)
+    plane_of = [int(plane) // 64 for plane in (cap_rays.PX, cap_rays.PY, cap_rays.KX, cap_rays.KY, cap_rays.DIM)]
+    for plane in range(5):
+        powers = tile[:, 3 * plane : 3 * plane + 3].astype(np.float64)
+        values = np.polynomial.polynomial.polyval2d(*at, powers)
+        np.testing.assert_allclose(rays[plane_of[plane], :24], values, rtol=1e-4, atol=1e-3)
+        changes = np.polynomial.polynomial.polyval2d(*at, np.polynomial.polynomial.polyder(powers))
+        np.testing.assert_allclose(np.polyval(slopes[3 * plane : 3 * plane + 3][::-1], at[1]), changes, rtol=1e-4)
+    room = 9 - np.square(rays[:2, :24].astype(np.float64)).sum(0)
+    np.testing.assert_allclose(rays[int(cap_rays.NEXT) // 64, :24], room, rtol=1e-4, atol=1e-2)
+    gains = rng.choice([0.0, 0.5], (2, 25))
+    for plane, row in zip((cap_rays.ABOVE, cap_rays.BELOW), gains, strict=True):
+        rays[int(plane + cap_rays.GAIN) // 64, :25] = row
+    cap_tiles.lit(rays.reshape(-1), 0, 24)
+    corners = (gains[:, :-1] > 0).sum(0) + (gains[:, 1:] > 0).sum(0)
+    np.testing.assert_array_equal(rays[int(cap_tiles.LITS) // 64, :24], np.select([corners == 4, corners > 0], [2, 1]))
 
 
 @pytest.mark.parametrize(("normal", "coefficients"), [((0, 0, 1), ()), ((0.3, -0.2, 0.93), (-0.2, 0.05, 1e-3, -5e-4))])
