@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .compile import fused, fused_part
-from .in_common import common_of, rows_of
+from .in_common import common_of, some_of
 
 U = np.uint64
 
@@ -15,8 +15,8 @@ U = np.uint64
 @fused
 def exchange(
     pairs: Any, begin: Any, shapes: Any, side: Any, atoms: Any, along: Any, variance: Any, price: Any, columns: Any,
-    cost: Any, low: Any, there: Any, rects: Any, rounds: int, gain: float, taken: Any, count: Any, inverse: Any,
-    weight: Any, rows: Any, room: Any, base: Any,
+    cost: Any, low: Any, there: Any, ends: Any, right: Any, down: Any, rounds: int, gain: float, taken: Any,
+    count: Any, inverse: Any, weight: Any, rows: Any, room: Any, base: Any,
 ) -> Any:  # fmt: skip
     """Change the texels taken, the first `count` of `taken`, and return how many there are then.
 
@@ -51,7 +51,7 @@ def exchange(
                 known = worst
             continue
         while known < count:
-            widen(pairs, begin, shapes, side, atoms[taken[known]], rects, base, there, own[known])
+            widen(pairs, begin, shapes, side, atoms[taken[known]], ends, right, down, base, there, own[known])
             known += U(1)
         for i in range(there):
             texel = U(columns[i])
@@ -78,16 +78,17 @@ def exchange(
         else:
             other = U(which[best])
             taken[other] = U(columns[best])
-            widen(pairs, begin, shapes, side, atoms[taken[other]], rects, base, there, own[other])
+            widen(pairs, begin, shapes, side, atoms[taken[other]], ends, right, down, base, there, own[other])
     return count
 
 
 @fused_part
 def widen(
-    pairs: Any, begin: Any, shapes: Any, side: Any, texel: Any, rects: Any, base: Any, there: Any, line: Any
+    pairs: Any, begin: Any, shapes: Any, side: Any, texel: Any, ends: Any, right: Any, down: Any, base: Any, there: Any,
+    line: Any,
 ) -> None:  # fmt: skip
     """Write what a texel has in common with those offered, in double precision."""
-    rows_of(pairs, begin, shapes, side, texel, rects, base)
+    some_of(pairs, begin, shapes, side, texel, ends, right, down, base)
     for i in range(there):
         line[i] = np.float64(base[i])
 

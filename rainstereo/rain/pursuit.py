@@ -49,6 +49,7 @@ SHRUNK = 4
 FRESH = 1e-4  # part of a texel's variance that must be news after those taken before
 SCREENED, OFFERED = 12, 256
 """After so many texels of a pixel only so many others, those worth most then, are offered to it."""
+NEAR, STILL = 0.7, 1.0
 ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
 TOGETHER = 128  # pixels: few enough for the caches
 FINER, MOST_RAYS = 2, 0.5
@@ -59,7 +60,7 @@ LARGE, UNEVEN = 4, 2.0
 """Level of windows from which, and at which, the finest, photographs are more uneven than their statistics say: edges
 and whole objects; what errors there count for."""
 AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
-POINTS_ALONG, MOST_ALONG = 32, 4
+POINTS_ALONG, MOST_ALONG = 16, 4
 """Points along a pixel's side that rays stand for, each for its part, and along such a part, at most."""
 DENSE = 4.0
 """Such points a texel of the window, along each side of a ray's part of the pixel."""
@@ -206,7 +207,7 @@ class Pursuit:
         first = np.ascontiguousarray(first)  # as `compile_ahead` has it: another layout would be compiled anew
         choose(
             words.lags, pairs, begin, variance, _atoms(), shapes, self._prices(level), np.float32(FRESH) * variance,
-            SCREENED, OFFERED, ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each,
+            SCREENED, (np.float32(NEAR), np.float32(STILL)), ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each,
             np.float32(BINS * scale), np.float32(DENSE * scale), last, self.tree.border == "mirror", texel, weight,
             counts,
         )  # fmt: skip
