@@ -8,7 +8,7 @@ import numpy as np
 
 from .compile import compiled, inlined
 from .exchange import exchange
-from .in_common import common_of, rows_of, some_of
+from .in_common import rows_of, some_of
 from .window_sums import TOGETHER, WIDE, add, correlate, points
 
 U = np.uint64
@@ -26,8 +26,8 @@ def choose(
     """Write texels and their weights, (M, MOST) int64, float64, and how many, (M,).
 
     lags: `rain.pursuit._Dictionary`. pairs, begin: see `common_of`; variance: (A,) float32 of texels. atoms: (A, 3)
-    int64 shape, column and row of each texel of a window, those of the window's own first. shapes: (S, 5) int64
-    halvings across and down, width, height and first number of the copy, which is empty if none is offered. price,
+    int64 shape, column and row of each texel of a window, those of the window's own first. shapes: (S, 6) int64
+    halvings across and down, columns and rows that are offered, and first number and width of the copy. price,
     least: (A,) float32: what a texel must be worth, and what must be news of its variance. screened, kept: see
     `rain.pursuit`. rounds, gain: see `rain.exchange`. negative,
     ridge, grows: what weights below 0 may add up to, and what their square sum costs, more and more, where it is more.
@@ -43,6 +43,7 @@ def choose(
     base, bases = np.empty(size + U(WIDE), np.float32), np.empty((most, size), np.float32)
     near, rects = np.empty(size, np.float32), np.zeros((len(shapes), 4), np.int64)
     ends, right, down = np.empty(len(shapes), np.uint64), np.empty(size, np.int64), np.empty(size, np.int64)
+    index = np.empty(size + U(1), np.uint32)
     taken, between, box = np.empty(most, np.uint64), np.empty((most, most), np.float64), np.empty(4, np.int64)
     x, y, share = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     u, v, starts = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
@@ -71,7 +72,7 @@ def choose(
             if count > U(1):
                 note(near, score, score[best], there)
             if count == U(screened):
-                there, best = screen(kept, near, score, count, best, there, rest, news, cost, low, columns, bases)
+                there, best = screen(kept, near, score, count, best, there, rest, news, cost, low, columns, bases, index)
                 fewer = True
                 place(columns, atoms, there, ends, right, down)
             own = atoms[taken[count]]
@@ -82,17 +83,12 @@ def choose(
             orthogonal(base, bases, count, best, there)
             go_on(base, bases[count], rest, news, cost, low, score, best, there)
             count += U(1)
-        there, best = screen(kept, near, score, U(0), U(0), there, rest, news, cost, low, columns, bases)
+        there, best = screen(kept, near, score, U(0), U(0), there, rest, news, cost, low, columns, bases, index)
         place(columns, atoms, there, ends, right, down)
         count = exchange(
             pairs, begin, shapes, side, atoms, along, variance, price, columns, cost, low, there, ends, right, down,
-            rounds, gain, taken, count, inverse, inner, lines, spare, base,
+            rounds, gain, taken, count, between, inverse, inner, lines, spare, base,
         )  # fmt: skip
-        for number in range(count):
-            for before in range(number + U(1)):
-                between[number, before] = common_of(
-                    pairs, begin, shapes, side, atoms[taken[number]], atoms[taken[before]]
-                )
         toll = 0.0
         while True:
             solve(between, along, taken, count, total, toll, factor, free, even, weight[pixel])
@@ -108,7 +104,7 @@ def choose(
             shape = U(atoms[i, U(0)])
             across = (column >> shapes[shape, U(0)]) + atoms[i, U(1)]
             line = (row >> shapes[shape, U(1)]) + atoms[i, U(2)]
-            texel[pixel, number] = shapes[shape, U(4)] + line * shapes[shape, U(2)] + across
+            texel[pixel, number] = shapes[shape, U(4)] + line * shapes[shape, U(5)] + across
 
 
 @inlined
@@ -200,7 +196,7 @@ def note(near: Any, score: Any, highest: Any, there: Any) -> None:
 @inlined
 def screen(
     kept: Any, near: Any, score: Any, number: Any, best: Any, there: Any, rest: Any, news: Any, cost: Any, low: Any,
-    columns: Any, bases: Any,
+    columns: Any, bases: Any, index: Any,
 ) -> Any:  # fmt: skip
     """Keep the texels that came near to the best, or are worth something still; returns how many, and the best's place.
 
@@ -208,14 +204,18 @@ def screen(
     """
     at, made = best, U(0)
     for i in range(there):
-        if near[i] >= kept[0] or score[i] > kept[1]:
-            if i == best:
-                at = made
-            rest[made], news[made], cost[made], low[made] = rest[i], news[i], cost[i], low[i]
-            score[made], near[made], columns[made] = score[i], near[i], columns[i]
-            for before in range(number):
-                bases[before, made] = bases[before, i]
-            made += U(1)
+        index[made] = np.uint32(i)
+        made += U((near[i] >= kept[0]) | (score[i] > kept[1]))
+    for k in range(made):
+        i = U(index[k])
+        if i == best:
+            at = k
+        rest[k], news[k], cost[k], low[k] = rest[i], news[i], cost[i], low[i]
+        score[k], near[k], columns[k] = score[i], near[i], columns[i]
+    for before in range(number):
+        own = bases[before]
+        for k in range(made):
+            own[k] = own[U(index[k])]
     return made, at
 
 
