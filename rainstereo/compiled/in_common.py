@@ -66,7 +66,9 @@ def rows_of(pairs: Any, begin: Any, shapes: Any, side: Any, own: Any, rects: Any
 
 
 @inlined
-def some_of(pairs: Any, begin: Any, shapes: Any, side: Any, own: Any, ends: Any, right: Any, down: Any, base: Any) -> None:
+def some_of(
+    pairs: Any, begin: Any, shapes: Any, side: Any, own: Any, ends: Any, right: Any, down: Any, base: Any
+) -> None:
     """The same of a texel with some, of columns and rows (right, down); those of a shape end where `ends` says."""
     start = U(0)
     for shape in range(U(len(shapes))):

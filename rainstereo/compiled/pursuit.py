@@ -72,7 +72,9 @@ def choose(
             if count > U(1):
                 note(near, score, score[best], there)
             if count == U(screened):
-                there, best = screen(kept, near, score, count, best, there, rest, news, cost, low, columns, bases, index)
+                there, best = screen(
+                    kept, near, score, count, best, there, rest, news, cost, low, columns, bases, index
+                )
                 fewer = True
                 place(columns, atoms, there, ends, right, down)
             own = atoms[taken[count]]
