@@ -21,10 +21,10 @@ def exchange(
     """Change the texels taken, the first `count` of `taken`, and return how many there are then.
 
     pairs, begin, shapes, side, atoms: see `in_common`. along, variance, price: (A,) float32 of texels. columns, cost,
-    low: (A,) uint32, float32, of which the first `there` are of those offered, which are those of `rects`: numbers,
-    what they must be worth, and what must be news. rounds, gain: see `rain.exchange`. between: (MOST, MOST) float64, written: what the
-    texels that are taken then have in common. inverse: (MOST, MOST), weight:
-    (MOST,), rows: (2, MOST, A), room: (4, A) float64, base: (A + WIDE,) float32, to work in.
+    low: (A,) uint32, float32, of which the first `there` are of those offered: numbers, what they must be worth, and
+    what must be news. ends, right, down: see `some_of`. rounds, gain: see `rain.exchange`. between: (MOST, MOST)
+    float64, written: what the texels that are taken then have in common. inverse: (MOST, MOST), weight: (MOST,), rows:
+    (2, MOST, A), room: (4, A) float64, base: (A + WIDE,) float32, to work in.
     """
     own, seen = rows[U(0)], rows[U(1)]  # what texels taken have in common with those offered; the same, of their news
     rest, news, most, which = room[U(0)], room[U(1)], room[U(2)], room[U(3)]

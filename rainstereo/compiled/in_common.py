@@ -68,7 +68,7 @@ def rows_of(pairs: Any, begin: Any, shapes: Any, side: Any, own: Any, rects: Any
 @inlined
 def some_of(
     pairs: Any, begin: Any, shapes: Any, side: Any, own: Any, ends: Any, right: Any, down: Any, base: Any
-) -> None:
+) -> None:  # fmt: skip
     """The same of a texel with some, of columns and rows (right, down); those of a shape end where `ends` says."""
     start = U(0)
     for shape in range(U(len(shapes))):

@@ -27,10 +27,10 @@ def choose(
 
     lags: `rain.pursuit._Dictionary`. pairs, begin: see `common_of`; variance: (A,) float32 of texels. atoms: (A, 3)
     int64 shape, column and row of each texel of a window, those of the window's own first. shapes: (S, 6) int64
-    halvings across and down, columns and rows that are offered, and first number and width of the copy. price,
-    least: (A,) float32: what a texel must be worth, and what must be news of its variance. screened, kept: see
-    `rain.pursuit`. rounds, gain: see `rain.exchange`. negative,
-    ridge, grows: what weights below 0 may add up to, and what their square sum costs, more and more, where it is more.
+    halvings across and down, columns and rows that are offered, and first number and width of the copy. price, least:
+    (A,) float32: what a texel must be worth, and what must be news of its variance. screened, kept: see `SCREENED`,
+    `NEAR` and `STILL` in `rain.pursuit`. rounds, gain: see `rain.exchange`. negative, ridge, grows: what weights below
+    0 may add up to, and what their square sum costs, more and more, where it is more.
     around: texels around the rays that are near. first: (2, M) column and row of the windows. rays, most_points, fine,
     dense, last, mirrored: see `points`; rays are those of all pixels, (M, 7, K).
     """
@@ -204,20 +204,20 @@ def screen(
 
     bases: of which the first `number` are used.
     """
-    at, made = best, U(0)
+    made, at = U(0), U(0)
     for i in range(there):
         index[made] = np.uint32(i)
         made += U((near[i] >= kept[0]) | (score[i] > kept[1]))
     for k in range(made):
-        i = U(index[k])
-        if i == best:
-            at = k
-        rest[k], news[k], cost[k], low[k] = rest[i], news[i], cost[i], low[i]
-        score[k], near[k], columns[k] = score[i], near[i], columns[i]
+        old = U(index[k])
+        rest[k], news[k], cost[k], low[k] = rest[old], news[old], cost[old], low[old]
+        score[k], near[k], columns[k] = score[old], near[old], columns[old]
     for before in range(number):
         own = bases[before]
         for k in range(made):
             own[k] = own[U(index[k])]
+    while at < made and U(index[at]) < best:
+        at += U(1)
     return made, at
 
 

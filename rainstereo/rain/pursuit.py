@@ -49,9 +49,8 @@ SHRUNK = 4
 FRESH = 1e-4  # part of a texel's variance that must be news after those taken before
 SCREENED = 10
 NEAR, STILL = 0.7, 0.5
-"""After so many texels of a pixel, and in exchanges (`exchange`), only some others are offered to it: what once was worth
-so much of what the one was worth that was taken then, the third or a later one, or is worth so much of its price still.
-"""
+"""After so many texels of a pixel, and in exchanges, only some others are offered to it: those that were once worth so
+much of what the one was that was taken then, as the third or later, or that are worth so much of their price still."""
 TOGETHER = 128  # pixels: few enough for the caches
 FINER, MOST_RAYS = 2, 0.5
 """Levels by which a window must be finer that holds the most of a pixel's rays, so that it and the rest are apart."""
@@ -208,9 +207,9 @@ class Pursuit:
         first = np.ascontiguousarray(first)  # as `compile_ahead` has it: another layout would be compiled anew
         choose(
             words.lags, pairs, begin, variance, _atoms(), shapes, self._prices(level), np.float32(FRESH) * variance,
-            SCREENED, (np.float32(NEAR), np.float32(STILL)), ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each,
-            np.float32(BINS * scale), np.float32(DENSE * scale), last, self.tree.border == "mirror", texel, weight,
-            counts,
+            SCREENED, (np.float32(NEAR), np.float32(STILL)), ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first,
+            rays, each, np.float32(BINS * scale), np.float32(DENSE * scale), last, self.tree.border == "mirror", texel,
+            weight, counts,
         )  # fmt: skip
         return _Chosen(texel, weight, counts)
 
@@ -409,7 +408,8 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple
         good = (highest[:, 0] > (number > 0)) & (number < MOST)
         others[rows[~good]] = kept[~good]
         if not good.all():
-            rows, score, rest, news, near, kept = (each[good] for each in (rows, score, rest, news, near, kept))
+            rows, kept = rows[good], kept[good]
+            score, rest, news, near = (each[good] for each in (score, rest, news, near))
             bases = np.concatenate([bases[:number, good], np.empty((MOST - number, *rest.shape), np.float32)])
         if not rows.size:
             break

@@ -82,10 +82,10 @@ class Renderer:
     what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).
     lasting: whether a plan serves hundreds of frames: planned in twice the time (ten times that without numba), of a
     fifth of the texels (`pursuit`), and with finer rays at outlines, so that drops are within the tolerance of 1024
-    rays a pixel, of which 64 are off by nearly as much; with numba and a tolerance from 0.9 to 2.5 so are all plans, but
-    a sequence's, of drops through which more than 0.3 of the frame's pixels look. 16-bit and floating point frames
-    may then show values a little beyond the image's. With numba any plan of drops at rest is made by up to four
-    threads, if OpenCV may use as many (`cv2.setNumThreads`); their number changes no bit.
+    rays a pixel, of which 64 are off by nearly as much. With numba and a tolerance from 0.9 to 2.5 all plans but a
+    sequence's are so of drops through which more than 0.3 of the frame's pixels look. 16-bit and floating point
+    frames may then show values a little beyond the image's. With numba any plan of drops at rest is made by up to
+    four threads, if OpenCV may use as many (`cv2.setNumThreads`); their number changes no bit.
     """
 
     camera: Camera
@@ -160,7 +160,7 @@ class Renderer:
         return [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in outlines.groups()]
 
     def lookups(self, groups: Sequence[Group], numbers: Iterable[int], whole: bool = False) -> list[Any]:
-        """What pixels look at in groups of drops, which get these numbers; whole: whether these are all of a frame's."""
+        """What pixels look at in groups of drops, which get these numbers. whole: whether it is all of a frame."""
         if not groups:
             return []
         given = np.fromiter(numbers, dtype=np.intp)
