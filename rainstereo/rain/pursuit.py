@@ -396,7 +396,7 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple
     rest: Image = along.astype(np.float32)
     news: Image = np.where(offered, variance, np.float32(np.inf))
     near: Image = np.zeros_like(rest)
-    bases: Image = np.empty((MOST, *along.shape), dtype=np.float32)
+    bases: list[Image] = []
     for number in range(MOST + 1):
         score: Image = rest * rest
         score /= news * price
@@ -410,7 +410,7 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple
         if not good.all():
             rows, kept = rows[good], kept[good]
             score, rest, news, near = (each[good] for each in (score, rest, news, near))
-            bases = np.concatenate([bases[:number, good], np.empty((MOST - number, *rest.shape), np.float32)])
+            bases = [before[good] for before in bases]
         if not rows.size:
             break
         best, every = score.argmax(1), np.arange(len(rows))
@@ -419,12 +419,11 @@ def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple
         taken[rows, number] = best
         counts[rows] += 1
         base = gram[best]
-        for before in bases[:number]:
+        for before in bases:
             base -= before[every, best][:, None] * before
         base *= (1 / np.sqrt(news[every, best]))[:, None]
         rest -= (rest[every, best] / np.sqrt(news[every, best]))[:, None] * base
-        bases[number] = base
-        base *= base
-        news -= base
+        bases.append(base)
+        news -= base * base
         news[news <= least] = np.inf
     return taken, counts, others

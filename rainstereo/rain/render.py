@@ -80,7 +80,7 @@ class Renderer:
     with lenses that only mrcal knows, and for other shapes, drops are planned with a few looks a pixel (`single_ray`):
     in some four times as long, and off by 4. Drops under gravity are drawn as caps of their volume where the bound of
     what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).
-    lasting: whether a plan serves hundreds of frames: planned in twice the time (ten times that without numba), of a
+    lasting: whether a plan serves hundreds of frames: planned in twice the time (fifty times, without numba), of a
     fifth of the texels (`pursuit`), and with finer rays at outlines, so that drops are within the tolerance of 1024
     rays a pixel, of which 64 are off by nearly as much. With numba and a tolerance from 0.9 to 2.5 all plans but a
     sequence's are so of drops through which more than 0.3 of the frame's pixels look. 16-bit and floating point
