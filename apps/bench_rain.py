@@ -120,7 +120,7 @@ def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised
         drops = _rain(camera, pane, share, seed)
         truth: Truth | None = None
         for renderer, name in ((lasting, ""), (default, ", by default"), (coarse, ", coarse")):
-            if share > 0.5 and renderer is not lasting:
+            if share > 0.5 and renderer is coarse:
                 continue
             plan = renderer.plan(drops)
             label = f"{100 * share:.0f} %{name}"

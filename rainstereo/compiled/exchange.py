@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .compile import fused, fused_part
-from .in_common import common_of, rows_of
+from .in_common import common_of, some_of
 
 U = np.uint64
 
@@ -15,24 +15,26 @@ U = np.uint64
 @fused
 def exchange(
     pairs: Any, begin: Any, shapes: Any, side: Any, atoms: Any, along: Any, variance: Any, price: Any, columns: Any,
-    cost: Any, low: Any, there: Any, rects: Any, rounds: int, gain: float, taken: Any, count: Any, inverse: Any,
-    weight: Any, rows: Any, room: Any, base: Any,
+    cost: Any, low: Any, there: Any, ends: Any, right: Any, down: Any, rounds: int, gain: float, taken: Any,
+    count: Any, between: Any, inverse: Any, weight: Any, rows: Any, room: Any, base: Any,
 ) -> Any:  # fmt: skip
     """Change the texels taken, the first `count` of `taken`, and return how many there are then.
 
     pairs, begin, shapes, side, atoms: see `in_common`. along, variance, price: (A,) float32 of texels. columns, cost,
-    low: (A,) uint32, float32, of which the first `there` are of those offered, which are those of `rects`: numbers,
-    what they must be worth, and what must be news. rounds, gain: see `rain.exchange`. inverse: (MOST, MOST), weight:
-    (MOST,), rows: (2, MOST, A), room: (4, A) float64, base: (A + WIDE,) float32, to work in.
+    low: (A,) uint32, float32, of which the first `there` are of those offered: numbers, what they must be worth, and
+    what must be news. ends, right, down: see `some_of`. rounds, gain: see `rain.exchange`. between: (MOST, MOST)
+    float64, written: what the texels that are taken then have in common. inverse: (MOST, MOST), weight: (MOST,), rows:
+    (2, MOST, A), room: (4, A) float64, base: (A + WIDE,) float32, to work in.
     """
     own, seen = rows[U(0)], rows[U(1)]  # what texels taken have in common with those offered; the same, of their news
     rest, news, most, which = room[U(0)], room[U(1)], room[U(2)], room[U(3)]
     known = U(0)  # rows of `own` that are written
+    for number in range(count):
+        relate(pairs, begin, shapes, side, atoms, taken, number, number + U(1), between)
     for _ in range(rounds):
         for i in range(count):
-            for j in range(i + U(1)):
-                one = np.float64(common_of(pairs, begin, shapes, side, atoms[taken[i]], atoms[taken[j]]))
-                inverse[i, j], inverse[j, i] = one, one
+            for j in range(count):
+                inverse[i, j] = between[i, j]
         invert(along, taken, count, inverse, weight)
         worst, least = count, 1.0
         if count > U(1):
@@ -43,6 +45,8 @@ def exchange(
         if worst < count:
             count -= U(1)
             taken[worst] = taken[count]
+            if worst < count:
+                relate(pairs, begin, shapes, side, atoms, taken, worst, count, between)
             if known > count:
                 for i in range(there):
                     own[worst, i] = own[count, i]
@@ -51,7 +55,7 @@ def exchange(
                 known = worst
             continue
         while known < count:
-            widen(pairs, begin, shapes, side, atoms[taken[known]], rects, base, there, own[known])
+            widen(pairs, begin, shapes, side, atoms[taken[known]], ends, right, down, base, there, own[known])
             known += U(1)
         for i in range(there):
             texel = U(columns[i])
@@ -72,35 +76,53 @@ def exchange(
             best += U(1)
         if best == there or not highest > gain * cost[best]:
             break
-        if which[best] < 0.0:
-            taken[count] = U(columns[best])
-            count += U(1)
-        else:
-            other = U(which[best])
-            taken[other] = U(columns[best])
-            widen(pairs, begin, shapes, side, atoms[taken[other]], rects, base, there, own[other])
+        other = count if which[best] < 0.0 else U(which[best])
+        taken[other] = U(columns[best])
+        count = max(count, other + U(1))
+        relate(pairs, begin, shapes, side, atoms, taken, other, count, between)
+        if other < known:
+            widen(pairs, begin, shapes, side, atoms[taken[other]], ends, right, down, base, there, own[other])
     return count
 
 
 @fused_part
+def relate(
+    pairs: Any, begin: Any, shapes: Any, side: Any, atoms: Any, taken: Any, number: Any, count: Any, between: Any
+) -> None:  # fmt: skip
+    """Write what one of the texels taken has in common with all."""
+    for i in range(count):
+        one = np.float64(common_of(pairs, begin, shapes, side, atoms[taken[number]], atoms[taken[i]]))
+        between[number, i], between[i, number] = one, one
+
+
+@fused_part
 def widen(
-    pairs: Any, begin: Any, shapes: Any, side: Any, texel: Any, rects: Any, base: Any, there: Any, line: Any
+    pairs: Any, begin: Any, shapes: Any, side: Any, texel: Any, ends: Any, right: Any, down: Any, base: Any, there: Any,
+    line: Any,
 ) -> None:  # fmt: skip
     """Write what a texel has in common with those offered, in double precision."""
-    rows_of(pairs, begin, shapes, side, texel, rects, base)
+    some_of(pairs, begin, shapes, side, texel, ends, right, down, base)
     for i in range(there):
         line[i] = np.float64(base[i])
 
 
 @fused_part
 def combine(factors: Any, own: Any, count: Any, there: Any, line: Any) -> None:
-    """Write a weighted sum of rows."""
+    """Write a weighted sum of rows: four of them in a sweep."""
     for i in range(there):
         line[i] = 0.0
-    for k in range(count):
+    k = U(0)
+    while k + U(4) <= count:
+        one, two, three, four = own[k], own[k + U(1)], own[k + U(2)], own[k + U(3)]
+        a, b, c, d = factors[k], factors[k + U(1)], factors[k + U(2)], factors[k + U(3)]
+        for i in range(there):
+            line[i] = (((line[i] + a * one[i]) + b * two[i]) + c * three[i]) + d * four[i]
+        k += U(4)
+    while k < count:
         factor, row = factors[k], own[k]
         for i in range(there):
             line[i] += factor * row[i]
+        k += U(1)
 
 
 @fused_part

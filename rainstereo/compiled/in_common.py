@@ -63,3 +63,17 @@ def rows_of(pairs: Any, begin: Any, shapes: Any, side: Any, own: Any, rects: Any
         for k in range(rects[shape, U(2)], rects[shape, U(3)] + 1):
             copy(pairs, U(first + k * apart + left), base, at, count)
             at += count
+
+
+@inlined
+def some_of(
+    pairs: Any, begin: Any, shapes: Any, side: Any, own: Any, ends: Any, right: Any, down: Any, base: Any
+) -> None:  # fmt: skip
+    """The same of a texel with some, of columns and rows (right, down); those of a shape end where `ends` says."""
+    start = U(0)
+    for shape in range(U(len(shapes))):
+        if ends[shape] > start:
+            first, apart = place_of(begin, shapes, side, own, shape)
+            for i in range(start, ends[shape]):
+                base[i] = pairs[U(first + down[i] * apart + right[i])]
+            start = ends[shape]

@@ -8,28 +8,29 @@ import numpy as np
 
 from .compile import compiled, inlined
 from .exchange import exchange
-from .in_common import common_of, rows_of
+from .in_common import rows_of, some_of
 from .window_sums import TOGETHER, WIDE, add, correlate, points
 
 U = np.uint64
 FAR = np.float32(np.inf)
+BLOCK = U(64)  # scores whose highest is found before where it is
 ZERO, ONE = np.float32(0), np.float32(1)
 
 
 @compiled
 def choose(
     lags: Any, pairs: Any, begin: Any, variance: Any, atoms: Any, shapes: Any, price: Any, least: Any, screened: int,
-    fewer: int, rounds: int, gain: float, negative: float, ridge: float, grows: float, around: int, first: Any,
+    kept: Any, rounds: int, gain: float, negative: float, ridge: float, grows: float, around: int, first: Any,
     rays: Any, most_points: int, fine: Any, dense: Any, last: Any, mirrored: bool, texel: Any, weight: Any, counts: Any,
 ) -> None:  # fmt: skip
     """Write texels and their weights, (M, MOST) int64, float64, and how many, (M,).
 
     lags: `rain.pursuit._Dictionary`. pairs, begin: see `common_of`; variance: (A,) float32 of texels. atoms: (A, 3)
-    int64 shape, column and row of each texel of a window, those of the window's own first. shapes: (S, 5) int64
-    halvings across and down, width, height and first number of the copy, which is empty if none is offered. price,
-    least: (A,) float32: what a texel must be worth, and what must be news of its variance. After so many texels
-    (`screened`) only `fewer` others, those worth most then, are offered. rounds, gain: see `rain.exchange`. negative,
-    ridge, grows: what weights below 0 may add up to, and what their square sum costs, more and more, where it is more.
+    int64 shape, column and row of each texel of a window, those of the window's own first. shapes: (S, 6) int64
+    halvings across and down, columns and rows that are offered, and first number and width of the copy. price, least:
+    (A,) float32: what a texel must be worth, and what must be news of its variance. screened, kept: see `SCREENED`,
+    `NEAR` and `STILL` in `rain.pursuit`. rounds, gain: see `rain.exchange`. negative, ridge, grows: what weights below
+    0 may add up to, and what their square sum costs, more and more, where it is more.
     around: texels around the rays that are near. first: (2, M) column and row of the windows. rays, most_points, fine,
     dense, last, mirrored: see `points`; rays are those of all pixels, (M, 7, K).
     """
@@ -40,7 +41,9 @@ def choose(
     columns, rest, news = np.empty(size, np.uint32), np.empty(size, np.float32), np.empty(size, np.float32)
     cost, low, score = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     base, bases = np.empty(size + U(WIDE), np.float32), np.empty((most, size), np.float32)
-    rects = np.zeros((len(shapes), 4), np.int64)
+    near, rects = np.empty(size, np.float32), np.zeros((len(shapes), 4), np.int64)
+    ends, right, down = np.empty(len(shapes), np.uint64), np.empty(size, np.int64), np.empty(size, np.int64)
+    index = np.empty(size + U(1), np.uint32)
     taken, between, box = np.empty(most, np.uint64), np.empty((most, most), np.float64), np.empty(4, np.int64)
     x, y, share = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     u, v, starts = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
@@ -59,40 +62,35 @@ def choose(
             shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low, rects
         )
         for i in range(there):
-            score[i] = rest[i] * rest[i] / (news[i] * cost[i])
-        count, fewer_left = U(0), False
-        for number in range(most):
+            score[i], near[i] = rest[i] * rest[i] / (news[i] * cost[i]), ZERO
+        count, fewer = U(0), False
+        while count < most:
             best = highest(score, there)
-            if best == there or (number > U(0) and not score[best] > 1):
+            if best == there or (count > U(0) and not score[best] > 1):
                 break
-            chosen = U(columns[best])
-            taken[number] = chosen
-            count += U(1)
-            if number == U(screened) and there > U(fewer):
-                there = screen(score, U(fewer), number, there, rest, news, cost, low, columns, bases)
-                best, fewer_left = U(0), True
-                while U(columns[best]) != chosen:
-                    best += U(1)
-            own = atoms[chosen]
-            if number < U(screened) or not fewer_left:
-                rows_of(pairs, begin, shapes, side, own, rects, base)
-            else:
-                for i in range(there):
-                    base[i] = common_of(pairs, begin, shapes, side, own, atoms[columns[i]])
-            orthogonal(base, bases, number, best, there)
-            go_on(base, bases[number], rest, news, cost, low, score, best, there)
-        there = offer(
-            shapes, side, column, row, box, along, variance, price, least, columns, rest, news, cost, low, rects
-        )
-        count = exchange(
-            pairs, begin, shapes, side, atoms, along, variance, price, columns, cost, low, there, rects, rounds, gain,
-            taken, count, inverse, inner, lines, spare, base,
-        )  # fmt: skip
-        for number in range(count):
-            for before in range(number + U(1)):
-                between[number, before] = common_of(
-                    pairs, begin, shapes, side, atoms[taken[number]], atoms[taken[before]]
+            taken[count] = U(columns[best])
+            if count > U(1):
+                note(near, score, score[best], there)
+            if count == U(screened):
+                there, best = screen(
+                    kept, near, score, count, best, there, rest, news, cost, low, columns, bases, index
                 )
+                fewer = True
+                place(columns, atoms, there, ends, right, down)
+            own = atoms[taken[count]]
+            if fewer:
+                some_of(pairs, begin, shapes, side, own, ends, right, down, base)
+            else:
+                rows_of(pairs, begin, shapes, side, own, rects, base)
+            orthogonal(base, bases, count, best, there)
+            go_on(base, bases[count], rest, news, cost, low, score, best, there)
+            count += U(1)
+        there, best = screen(kept, near, score, U(0), U(0), there, rest, news, cost, low, columns, bases, index)
+        place(columns, atoms, there, ends, right, down)
+        count = exchange(
+            pairs, begin, shapes, side, atoms, along, variance, price, columns, cost, low, there, ends, right, down,
+            rounds, gain, taken, count, between, inverse, inner, lines, spare, base,
+        )  # fmt: skip
         toll = 0.0
         while True:
             solve(between, along, taken, count, total, toll, factor, free, even, weight[pixel])
@@ -106,9 +104,9 @@ def choose(
         for number in range(count):
             i = taken[number]
             shape = U(atoms[i, U(0)])
-            right = (column >> shapes[shape, U(0)]) + atoms[i, U(1)]
-            below = (row >> shapes[shape, U(1)]) + atoms[i, U(2)]
-            texel[pixel, number] = shapes[shape, U(4)] + below * shapes[shape, U(2)] + right
+            across = (column >> shapes[shape, U(0)]) + atoms[i, U(1)]
+            line = (row >> shapes[shape, U(1)]) + atoms[i, U(2)]
+            texel[pixel, number] = shapes[shape, U(4)] + line * shapes[shape, U(5)] + across
 
 
 @inlined
@@ -142,12 +140,15 @@ def offer(
 def highest(score: Any, there: Any) -> Any:
     """The first of the highest scores, as whole numbers, which scores that are not negative are ordered as; `there` if
     none is above 0."""
-    order, most, best = score.view(np.int32), np.int32(0), U(0)
-    for i in range(there):
-        most = max(most, order[i])
-    if most == np.int32(0):
-        return there
-    while order[best] != most:
+    order, most, best, first = score.view(np.int32), np.int32(0), there, U(0)
+    while first < there:
+        last, own = min(first + BLOCK, there), np.int32(0)
+        for i in range(first, last):
+            own = max(own, order[i])
+        if own > most:
+            most, best = own, first
+        first = last
+    while best < there and order[best] != most:
         best += U(1)
     return best
 
@@ -186,25 +187,51 @@ def go_on(base: Any, own: Any, rest: Any, news: Any, cost: Any, low: Any, score:
         score[i] = rest[i] * rest[i] / (news[i] * cost[i])
 
 
-@compiled
+@inlined
+def note(near: Any, score: Any, highest: Any, there: Any) -> None:
+    """Note how near to the highest scores come."""
+    part = ONE / highest
+    for i in range(there):
+        near[i] = max(near[i], score[i] * part)
+
+
+@inlined
 def screen(
-    score: Any, fewer: Any, number: Any, there: Any, rest: Any, news: Any, cost: Any, low: Any, columns: Any, bases: Any
-) -> Any:
-    """Keep the texels of the highest scores, in order; of equal ones the first."""
-    bound = np.partition(score[:there], there - fewer)[there - fewer]
-    even = fewer
+    kept: Any, near: Any, score: Any, number: Any, best: Any, there: Any, rest: Any, news: Any, cost: Any, low: Any,
+    columns: Any, bases: Any, index: Any,
+) -> Any:  # fmt: skip
+    """Keep the texels that came near to the best, or are worth something still; returns how many, and the best's place.
+
+    bases: of which the first `number` are used.
+    """
+    made, at = U(0), U(0)
     for i in range(there):
-        even -= U(score[i] > bound)
-    kept = U(0)
+        index[made] = np.uint32(i)
+        made += U((near[i] >= kept[0]) | (score[i] > kept[1]))
+    for k in range(made):
+        old = U(index[k])
+        rest[k], news[k], cost[k], low[k] = rest[old], news[old], cost[old], low[old]
+        score[k], near[k], columns[k] = score[old], near[old], columns[old]
+    for before in range(number):
+        own = bases[before]
+        for k in range(made):
+            own[k] = own[U(index[k])]
+    while at < made and U(index[at]) < best:
+        at += U(1)
+    return made, at
+
+
+@inlined
+def place(columns: Any, atoms: Any, there: Any, ends: Any, right: Any, down: Any) -> None:
+    """Write columns and rows of texels, and where those of each shape end."""
+    for shape in range(U(len(ends))):
+        ends[shape] = 0
     for i in range(there):
-        if score[i] > bound or (score[i] == bound and even > U(0)):
-            even -= U(score[i] == bound)
-            rest[kept], news[kept], cost[kept], low[kept] = rest[i], news[i], cost[i], low[i]
-            columns[kept] = columns[i]
-            for before in range(number):
-                bases[before, kept] = bases[before, i]
-            kept += U(1)
-    return kept
+        own = atoms[columns[i]]
+        ends[U(own[U(0)])] = i + U(1)
+        right[i], down[i] = own[U(1)], own[U(2)]
+    for shape in range(U(1), U(len(ends))):
+        ends[shape] = max(ends[shape], ends[shape - U(1)])
 
 
 @inlined

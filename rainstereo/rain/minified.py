@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 
 import cv2
 import numpy as np
 
+from rainstereo import compiled
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber
 from rainstereo.drop_grid import NOBODY
@@ -41,6 +42,8 @@ OUTLINE = 2
 """Times as many rays along a side at the outline of a drop, for plans that last."""
 CLEAR_STEP = 8
 LARGE = 1 << 22  # taps of a plan beyond which they are held in less memory, for a little more time in each frame
+CROWDED = 0.3
+"""Share of a frame's pixels: drops through which more look at the scene are planned as those that last are."""
 NOTHING, DARK, LIT = 0, 1, 2  # of a pixel
 EXTENTS = ((0.75, 33), (2.5, 17), (6.0, 9), (60.0, 5), (math.inf, 3))
 """Texels that a pixel may span, up to a tolerance."""
@@ -118,6 +121,11 @@ class Minifier:
     def __post_init__(self) -> None:
         self.clear = _clear_map(self.camera, self.chamber)
 
+    def of_frame(self, batches: Sequence[Batch]) -> list[Lookups]:
+        """`lookups` of all batches of a frame, which if they are large are found as if it was worth much time."""
+        crowded = not self.lasting and self._is_crowded(batches)
+        return (replace(self, lasting=True) if crowded else self).lookups(batches)
+
     def lookups(self, batches: Sequence[Batch]) -> list[Lookups]:
         """What every pixel of the batches that a drop covers looks at."""
         tables: list[Lookups] = []
@@ -145,6 +153,16 @@ class Minifier:
             forget()
             give_back()
         return tables
+
+    def _is_crowded(self, batches: Sequence[Batch]) -> bool:
+        """Whether the tree's texels would be too many for the time of a frame, and there are loops to find fewer."""
+        room = CROWDED * self.camera.width * self.camera.height
+        suits = self.tolerance >= STRICT and rays_along(self.tolerance) == rays_along(STRICT)
+        if not (suits and compiled.available()) or sum(len(batch.pixels) for batch in batches) <= room:
+            return False
+        for part in (part for batch in batches for part in batch.parts()):
+            room -= np.count_nonzero(_kind(self.traced(part, RAYS)) == LIT)
+        return room < 0
 
     def _narrow(self, tables: list[Lookups], wide: list[Lookups]) -> None:
         """Hold tables in less memory. wide: what takes more, and is waiting until it is many."""

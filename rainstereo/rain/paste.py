@@ -30,9 +30,11 @@ from .quadtree import UNIT
 from .texels import Texels
 from .words import clip, packed, unpack
 
-HELD, SMALL = 108, 1 << 20
+HELD, SMALL = 112, 1 << 20
 """Bytes for each pixel of an image, but for so many at least, that taps may take, in tables and ready for the loop."""
-READY = 4  # bytes of a tap that is ready for the loop; of two, where they are a pair
+FEW = 16  # taps of a row, up to which they weigh too much to be pairs mostly
+READY, PAIRED = 5, 3
+"""Bytes of a tap that is ready for the loop, with all that its row and cell take: in rows of few taps, and of more."""
 MATRICES = 1 << 23  # taps up to which sums are kept as matrices, where nothing is compiled
 ROWS = 1 << 14  # that are summed at a time: few enough for the caches
 DARKEST = 0.4  # gray levels that the rounding of bytes may be corrected by: black stays black
@@ -188,7 +190,9 @@ class Paste:
     @cached_property
     def _is_kept(self) -> bool:
         """Whether there is room for cells, and in a cell for each row: a renderer's have a few hundred taps at most."""
-        held = sum(table.bytes_of_taps for table in self.tables) + READY * self.taps
+        many = sum(int(table.counts[table.counts > FEW].sum(dtype=np.int64)) for table in self.tables)
+        ready = READY * (self.taps - many) + PAIRED * many
+        held = sum(table.bytes_of_taps for table in self.tables) + ready
         most = max(int(table.counts.max()) for table in self.tables)
         return held <= HELD * max(self.size[0] * self.size[1], SMALL) and most <= MOST
 

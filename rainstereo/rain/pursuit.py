@@ -47,9 +47,10 @@ SMALL = 9.0
 SHRUNK = 4
 """Times that the photographs are shrunk whose statistics are taken: sharp images have more of what is fine."""
 FRESH = 1e-4  # part of a texel's variance that must be news after those taken before
-SCREENED, OFFERED = 12, 256
-"""After so many texels of a pixel only so many others, those worth most then, are offered to it."""
-ACTIVE = 0.7  # share of pixels that still take texels below which the others are left out
+SCREENED = 10
+NEAR, STILL = 0.7, 0.5
+"""After so many texels of a pixel, and in exchanges, only some others are offered to it: those that were once worth so
+much of what the one was that was taken then, as the third or later, or that are worth so much of their price still."""
 TOGETHER = 128  # pixels: few enough for the caches
 FINER, MOST_RAYS = 2, 0.5
 """Levels by which a window must be finer that holds the most of a pixel's rays, so that it and the rest are apart."""
@@ -59,9 +60,9 @@ LARGE, UNEVEN = 4, 2.0
 """Level of windows from which, and at which, the finest, photographs are more uneven than their statistics say: edges
 and whole objects; what errors there count for."""
 AROUND = 1  # texels of the window around the rays in which, or in part, are the texels offered
-POINTS_ALONG, MOST_ALONG = 32, 4
+POINTS_ALONG, MOST_ALONG = 16, 2
 """Points along a pixel's side that rays stand for, each for its part, and along such a part, at most."""
-DENSE = 4.0
+DENSE = 2.0
 """Such points a texel of the window, along each side of a ray's part of the pixel."""
 
 
@@ -184,8 +185,8 @@ class Pursuit:
         offered, numbers = self._offered(level, first, _boxes(where, share))
         along = _sums(common.reshape(count, SIDE, SIDE))
         price, least = self._prices(level), np.float32(FRESH) * np.diag(words.gram)
-        taken, counts = _taken(words, along, offered, price)
-        taken, counts = exchanged(words.gram, along, offered, price, least, taken, counts)
+        taken, counts, others = _taken(words, along, offered, price)
+        taken, counts = exchanged(words.gram, along, others, price, least, taken, counts)
         weight = gentle_weights(words.gram, along, taken, counts, share.sum(1, dtype=np.float64))
         texel = np.take_along_axis(numbers, taken, 1)
         return _Chosen(texel, weight, counts)
@@ -206,9 +207,9 @@ class Pursuit:
         first = np.ascontiguousarray(first)  # as `compile_ahead` has it: another layout would be compiled anew
         choose(
             words.lags, pairs, begin, variance, _atoms(), shapes, self._prices(level), np.float32(FRESH) * variance,
-            SCREENED, OFFERED, ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first, rays, each,
-            np.float32(BINS * scale), np.float32(DENSE * scale), last, self.tree.border == "mirror", texel, weight,
-            counts,
+            SCREENED, (np.float32(NEAR), np.float32(STILL)), ROUNDS, GAIN, NEGATIVE, RIDGE, RIDGE_GROWS, AROUND, first,
+            rays, each, np.float32(BINS * scale), np.float32(DENSE * scale), last, self.tree.border == "mirror", texel,
+            weight, counts,
         )  # fmt: skip
         return _Chosen(texel, weight, counts)
 
@@ -218,21 +219,25 @@ class Pursuit:
         dear = np.array([DEAR if level + min(shape) < FEW else 1.0 for shape in SHAPES]) / uneven
         return (self.worth * dear[_atoms()[:, 0]]).astype(np.float32)
 
-    def _limits(self, level: int, shape: tuple[int, int]) -> tuple[int, int, int]:
-        """Width and height of the copy that has texels of a shape, 0 if there is none, and the number of its first."""
-        copy, start = self._copies.get((level + shape[0], level + shape[1]), (Copy(0, 0, 0, 0), 0))
-        return copy.width, copy.height, start
+    def _limits(self, level: int, shape: tuple[int, int]) -> tuple[int, int, int, int]:
+        """Columns and rows of texels of a shape that are offered, 0 if there is no copy of these, the number of the
+        copy's first, and its width. Long ones that end beyond the image are not: finer ones tell more of its edge."""
+        across, down = level + shape[0], level + shape[1]
+        copy, start = self._copies.get((across, down), (Copy(0, 0, 0, 0), 0))
+        if across == down or not copy.width:
+            return copy.width, copy.height, start, copy.width
+        return self.size[0] >> across, self.size[1] >> down, start, copy.width
 
     def _offered(self, level: int, first: Indices, boxes: Indices) -> tuple[Mask, Indices]:
         """Which texels of windows the image has and boxes meet, and their numbers, (M, A)."""
         number, j, i = _atoms().T
         across, down = np.array(SHAPES)[number].T
-        width, height, start = np.array([self._limits(level, shape) for shape in SHAPES])[number].T
+        wide, high, start, width = np.array([self._limits(level, shape) for shape in SHAPES])[number].T
         x, y = (first[0][:, None] >> across) + j, (first[1][:, None] >> down) + i
         left, right, top, bottom = boxes.T[:, :, None]
         near = ((j << across) <= right) & (((j + 1) << across) > left)
         near &= ((i << down) <= bottom) & (((i + 1) << down) > top)
-        return near & (x < width) & (y < height), start + y * width + x
+        return near & (x < wide) & (y < high), start + y * width + x
 
     @cached_property
     def _copies(self) -> dict[tuple[int, int], tuple[Copy, int]]:
@@ -329,9 +334,11 @@ def _dictionary(level: int) -> _Dictionary:
     points = min(POINTS, 2**level)
     inside = (np.arange(points) + 0.5) / points - 0.5
     inside = np.stack(np.meshgrid(inside, inside), -1).reshape(-1, 2)
-    away = (np.arange(-(SIDE - 1) * BINS, SIDE * BINS) + 0.5) / BINS - 0.5
-    of_places = _covariance(scene, away, inside, texel).astype(np.float32)
-    split = of_places.reshape(len(away) // BINS, BINS, len(away) // BINS, BINS)
+    bins = (np.arange(-(SIDE - 1) * BINS - 1, SIDE * BINS + 1) + 0.5) / BINS - 0.5
+    of_places = _covariance(scene, bins, inside, texel)
+    for _ in range(2):  # points stand for three bins by three
+        of_places = (of_places[:-2] + of_places[1:-1] + of_places[2:]).T / 3
+    split = of_places.astype(np.float32).reshape(2 * SIDE - 1, BINS, 2 * SIDE - 1, BINS)
     lags = np.ascontiguousarray(np.moveaxis(split, (1, 3), (0, 1))[:, :, ::-1, ::-1])
     between = (inside[:, None] - inside).reshape(-1, 2)
     return _Dictionary(lags, _covariance(scene, np.arange(1.0 - SIDE, SIDE), between, texel))
@@ -377,49 +384,46 @@ def _sums(values: Array) -> Array:
     return np.concatenate([found[shape].reshape(len(values), -1) for shape in SHAPES], 1)
 
 
-def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple[Indices, Indices]:
-    """Numbers of texels taken, (M, MOST), and how many, (M,). along: (M, A) covariances with the pixels."""
+def _taken(words: _Dictionary, along: Array, offered: Mask, price: Any) -> tuple[Indices, Indices, Mask]:
+    """Numbers of texels taken, (M, MOST), how many, (M,), and which may take their place, (M, A).
+
+    along: (M, A) covariances with the pixels.
+    """
     gram, count, variance = words.gram, len(along), np.diag(words.gram)
     taken: Indices = np.zeros((count, MOST), dtype=np.intp)
     counts: Indices = np.zeros(count, dtype=np.intp)
-    rows, every = np.arange(count), np.arange(count)
-    columns: Indices = np.broadcast_to(np.arange(len(variance)), along.shape)
+    others, rows, least = np.zeros_like(offered), np.arange(count), np.float32(FRESH) * variance
     rest: Image = along.astype(np.float32)
     news: Image = np.where(offered, variance, np.float32(np.inf))
-    cost, least = price, np.float32(FRESH) * variance
-    bases: Image = np.empty((MOST, *along.shape), dtype=np.float32)
-    for number in range(MOST):
+    near: Image = np.zeros_like(rest)
+    bases: list[Image] = []
+    for number in range(MOST + 1):
         score: Image = rest * rest
-        score /= news * cost
-        best = score.argmax(1)
-        good = score[every, best] > (number > 0)  # the first is taken whatever it is worth: sums of weights are kept
-        if number == SCREENED and len(variance) > OFFERED:
-            keep = np.sort(np.argpartition(score, -OFFERED, axis=1)[:, -OFFERED:], axis=1)
-            best = np.take_along_axis(score, keep, 1).argmax(1)
-            columns, rest, news = (np.take_along_axis(each, keep, 1) for each in (columns, rest, news))
-            cost, least = cost[columns], least[columns]
-            fewer: Image = np.empty((MOST, *rest.shape), dtype=np.float32)
-            for old, new in zip(bases[:number], fewer, strict=False):
-                new[...] = np.take_along_axis(old, keep, 1)
-            bases = fewer
-        if np.count_nonzero(good) < ACTIVE * len(rows):
-            if not good.any():
-                break
-            rows, best, rest, news, columns = (each[good] for each in (rows, best, rest, news, columns))
-            cost, least = (each[good] if each.ndim == 2 else each for each in (cost, least))
-            bases = np.concatenate([bases[:number, good], np.empty((MOST - number, *rest.shape), np.float32)])
-            every, good = np.arange(len(rows)), good[good]
-        chosen = columns[every, best]
-        taken[rows[good], number] = chosen[good]
-        counts[rows[good]] += 1
-        base = gram[chosen] if least.ndim == 1 else gram[chosen[:, None], columns]
-        for before in bases[:number]:
+        score /= news * price
+        highest: Image = score.max(1, keepdims=True)
+        if number > 1:
+            np.maximum(near, score * (1 / np.maximum(highest, np.float32(1))), out=near)
+        kept = (near >= np.float32(NEAR)) | (score > np.float32(STILL))
+        # the first is taken whatever it is worth: sums of weights are kept
+        good = (highest[:, 0] > (number > 0)) & (number < MOST)
+        others[rows[~good]] = kept[~good]
+        if not good.all():
+            rows, kept = rows[good], kept[good]
+            score, rest, news, near = (each[good] for each in (score, rest, news, near))
+            bases = [before[good] for before in bases]
+        if not rows.size:
+            break
+        best, every = score.argmax(1), np.arange(len(rows))
+        if number == SCREENED:
+            news[~kept], near[~kept] = np.inf, 0
+        taken[rows, number] = best
+        counts[rows] += 1
+        base = gram[best]
+        for before in bases:
             base -= before[every, best][:, None] * before
         base *= (1 / np.sqrt(news[every, best]))[:, None]
         rest -= (rest[every, best] / np.sqrt(news[every, best]))[:, None] * base
-        bases[number] = base
-        base *= base
-        news -= base
+        bases.append(base)
+        news -= base * base
         news[news <= least] = np.inf
-        rest[~good] = 0
-    return taken, counts
+    return taken, counts, others

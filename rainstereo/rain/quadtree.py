@@ -32,6 +32,7 @@ LOOSE = 2.5
 """Times the usual step between its rays, all along it, that a pixel's rays may span as one."""
 JUMP = 4.0
 """Times its neighbour's that the step of a ray may be whose other neighbour is dark."""
+APART = 8  # texels along a pixel that sees several places far apart, about
 MERGES = 3
 ALIGNED = 1 << MERGES
 UNIT = 1024
@@ -118,9 +119,10 @@ class Quadtree:
         return np.asarray((span > LOOSE * (1 + along * usual)) & (middle > 0))
 
     def _apart(self, x: Array, y: Array, weights: Array, steps: Steps) -> Taps:
-        """A texel for each ray, about as large as the ray's part of the scene."""
-        count, most = weights.shape[1], len(sizes(self.size)) - 1
+        """A texel for each ray, about as large as the ray's part of the scene, or as that of some `APART`^2 in all."""
+        count, most, fine = weights.shape[1], len(sizes(self.size)) - 1, math.isqrt(len(weights)) / APART
         size = np.sqrt(np.abs(steps[0] * steps[3] - steps[1] * steps[2]) + np.float32(1e-6))
+        size *= np.float32(max(fine, 1.0))
         level = np.clip(np.floor(np.log2(size) + np.float32(0.5)), 0, most).astype(np.intp)
         pixel, ray = np.nonzero((weights > 0).T)
         level = level[ray, pixel]
@@ -130,7 +132,13 @@ class Quadtree:
             for at, last in ((x, wide), (y, high))
         )
         texel = np.array(starts(self.size))[level] + i * wide[level] + j
-        return whole(pixel, texel, weights[ray, pixel], count, np.zeros(count))
+        weight: Any = weights[ray, pixel]
+        if fine > 1:  # several rays are one texel
+            every = int(texel.max(initial=0)) + 1
+            key, same = np.unique(pixel * every + texel, return_inverse=True)
+            pixel, texel = key // every, key % every
+            weight = np.bincount(same, weight, len(key))
+        return whole(pixel, texel, weight, count, np.zeros(count))
 
     def _together(self, x: Array, y: Array, weights: Array, steps: Steps, span: Array, side: int) -> Taps:
         count = weights.shape[1]

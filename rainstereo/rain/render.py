@@ -71,8 +71,7 @@ class Renderer:
     camera, chamber: the chamber in the camera's frame (`Rig.chamber_in`). Images are of the camera's size.
     depth: of the scene, metres; inf: no parallax.
     lens: aperture and focus; None: a pinhole. Through a lens each drop is a sharp layer blurred by a disc (`defocus`).
-    tolerance: gray levels RMS of 8 bits inside sharp drops, against 64 exact rays a pixel. inf: one
-    look a pixel, and hard edges, which is the fastest.
+    tolerance: gray levels RMS of 8 bits inside sharp drops, against 64 exact rays a pixel. inf: one look, hard edges.
     border: what lies beyond the image: "mirror", "edge", or a `Surround` of it, beyond which it is mirrored.
     linear_light: whether values are sRGB and light is to be averaged, not values.
     moving: whether most drops move from frame to frame: caps on far faces are then traced as they are drawn, by loops
@@ -81,11 +80,12 @@ class Renderer:
     with lenses that only mrcal knows, and for other shapes, drops are planned with a few looks a pixel (`single_ray`):
     in some four times as long, and off by 4. Drops under gravity are drawn as caps of their volume where the bound of
     what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).
-    lasting: whether a plan serves hundreds of frames: planned in five times the time (ten times that without numba),
-    of a quarter of the texels (`pursuit`), and with finer rays at outlines, so that drops are within the tolerance of
-    1024 rays a pixel, of which 64 are off by nearly as much. 16-bit and floating point frames may then show values a
-    little beyond the image's. With numba any plan of drops at rest is made by up to four threads, if OpenCV may use as
-    many (`cv2.setNumThreads`); their number changes no bit.
+    lasting: whether a plan serves hundreds of frames: planned in twice the time (fifty times, without numba), of a
+    fifth of the texels (`pursuit`), and with finer rays at outlines, so that drops are within the tolerance of 1024
+    rays a pixel, of which 64 are off by nearly as much. With numba and a tolerance from 0.9 to 2.5 all plans but a
+    sequence's are so of drops through which more than 0.3 of the frame's pixels look. 16-bit and floating point
+    frames may then show values a little beyond the image's. With numba any plan of drops at rest is made by up to
+    four threads, if OpenCV may use as many (`cv2.setNumThreads`); their number changes no bit.
     """
 
     camera: Camera
@@ -120,7 +120,7 @@ class Renderer:
         if tables is not None:
             return Plan(self, everyone, tables, tuple(layers))
         groups = self.groups(sharp)
-        return Plan(self, everyone, tuple(self.lookups(groups, range(len(groups)))), tuple(layers))
+        return Plan(self, everyone, tuple(self.lookups(groups, range(len(groups)), True)), tuple(layers))
 
     def tier(self, drop: Drop) -> DropTier:
         """By which optics a sharp drop is drawn: its own, or, if it moves and the bound allows it, those of its cap."""
@@ -159,13 +159,14 @@ class Renderer:
         outlines = Outlines.of(drops, self.camera, self.chamber)
         return [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in outlines.groups()]
 
-    def lookups(self, groups: Sequence[Group], numbers: Iterable[int]) -> list[Any]:
-        """What pixels look at in groups of drops, which get these numbers."""
+    def lookups(self, groups: Sequence[Group], numbers: Iterable[int], whole: bool = False) -> list[Any]:
+        """What pixels look at in groups of drops, which get these numbers. whole: whether it is all of a frame."""
         if not groups:
             return []
         given = np.fromiter(numbers, dtype=np.intp)
         if not self.moving:
-            return self._minifier.lookups(self._batches(groups, given))
+            find = self._minifier.of_frame if whole else self._minifier.lookups
+            return find(self._batches(groups, given))
         groups = [Group(tuple(self._cap_tiers.drawn(group.drops)), group.outlines) for group in groups]
         tables, others = list[Any](), list[int]()
         for panel, some in _by_far_face(groups).items():

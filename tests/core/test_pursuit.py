@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from rainstereo import Camera, Chamber, Panel
 from rainstereo.droplet import SphericalCap
 from rainstereo.patch import folded
-from rainstereo.rain.pursuit import MOST, SHRUNK, Pursuit
+from rainstereo.rain.pursuit import BINS, MOST, POINTS, SHRUNK, Pursuit, _dictionary, _scene
+from rainstereo.rain.pursuit import SIDE as SIDE_OF_WINDOW
 from rainstereo.rain.pyramid import copies, copy_starts, half, sizes, starts
 from rainstereo.rain.quadtree import UNIT, Quadtree, span_of, steps_between
 from rainstereo.rain.render import Renderer
@@ -249,3 +250,32 @@ def test_plans_that_last_for_other_types():
     assert np.abs(plan.apply(image.astype(np.uint16) * 257) / 257 - bytes_).max() <= 1.5
     assert np.abs(np.clip(plan.apply(image.astype(np.float32) / 255) * 255, 0, 255) - bytes_).max() <= 1.5
     np.testing.assert_array_equal(plan.apply(np.ascontiguousarray(image[..., 1])), bytes_[..., 1])
+
+
+def test_long_texels_end_within_the_image():
+    """Those that do not would be of fewer pixels than the statistics have it; square ones are always there."""
+    x, y = pixels(11, 300, 150)
+    firsts, shapes = np.array(copy_starts(SIZE)), copies(SIZE)
+    found = pursuit().taps(x, y, even(x)).texels
+    which = np.searchsorted(firsts, found, "right") - 1
+    ends = [(divmod(texel - firsts[n], shapes[n].width), shapes[n]) for texel, n in zip(found, which, strict=True)]
+    long = [(place, copy) for place, copy in ends if copy.across != copy.down]
+    assert len(long) > 100
+    for (row, column), copy in long:
+        assert (column + 1) << copy.across <= SIZE[0]
+        assert (row + 1) << copy.down <= SIZE[1]
+    assert any((column + 1) << copy.across > SIZE[0] for (_, column), copy in ends)
+
+
+def test_points_stand_for_three_bins():
+    """What is tabulated of a place and a texel, against the covariance at all pairs of points in both."""
+    level, texel = 2, 4.0
+    scene, lags = _scene(level), _dictionary(level).lags
+    inside = (np.arange(POINTS) + 0.5) / POINTS - 0.5
+    around = np.arange(-1, 2) / BINS
+    for i, j in ((0, 0), (5, 90), (93, 94), (150, 40)):
+        y, x = ((n + 0.5) / BINS - 0.5 - (SIDE_OF_WINDOW - 1) for n in (i, j))
+        dy, dx = (at + around[:, None] - inside for at in (y, x))
+        expected = scene.at(texel * np.hypot(dx[:, None, :, None], dy[None, :, None, :])).mean() + scene.mean**2
+        last = len(lags[0, 0]) - 1
+        np.testing.assert_allclose(lags[i % BINS, j % BINS, last - i // BINS, last - j // BINS], expected, rtol=1e-5)

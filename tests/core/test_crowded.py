@@ -1,0 +1,76 @@
+"""Plans of so many pixels that they are made as those that last, and what their taps take."""
+
+import numpy as np
+import pytest
+
+from rainstereo import Camera, Chamber, Panel, compiled
+from rainstereo.droplet import SphericalCap
+from rainstereo.rain.minified import CROWDED
+from rainstereo.rain.paste import FEW, PAIRED, READY
+from rainstereo.rain.render import Plan, Renderer
+from rainstereo.trace import Fate, trace
+
+SIZE = (160, 120)
+CAMERA = Camera.pinhole(400, 400, 79.5, 59.5, *SIZE)
+PANE = Chamber((0, 0, 1), 0.057, (Panel(0.003, 1.49),))
+needs_numba = pytest.mark.skipif(not compiled.available(), reason="needs numba")
+
+
+def drops(radius: float) -> list[SphericalCap]:
+    return [SphericalCap((x, y), radius, 0.6) for x in (-5e-3, 5e-3) for y in (-4e-3, 4e-3)]
+
+
+def lit(radius: float) -> float:
+    """Share of the frame's pixels whose middle sees the scene through a drop."""
+    own = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in SIZE)), -1)
+    return float(np.mean(trace(own, drops(radius), CAMERA, PANE).status == Fate.THROUGH))
+
+
+def same(one: Plan, other: Plan) -> bool:
+    columns = [[column for table in plan.tables for _, column in table.columns()] for plan in (one, other)]
+    return len(columns[0]) == len(columns[1]) and all(
+        np.array_equal(*pair, equal_nan=pair[0].dtype.kind == "f") for pair in zip(*columns, strict=True)
+    )
+
+
+def plan(radius: float, **way: object) -> Plan:
+    return Renderer(CAMERA, PANE, **way).plan(drops(radius))
+
+
+@needs_numba
+@pytest.mark.parametrize("radius", [1.9e-3, 2.2e-3, 3.0e-3, 3.4e-3])
+def test_drops_that_many_pixels_look_through(radius):
+    """As those that last from a share of the frame on, which one ray a pixel tells as well; by the tree below it."""
+    share = lit(radius)
+    assert abs(share - CROWDED) > 0.02
+    assert same(plan(radius), plan(radius, lasting=True)) == (share > CROWDED)
+    tree = Renderer(CAMERA, PANE).sequence().plan(drops(radius))
+    assert same(plan(radius), tree) == (share < CROWDED)
+
+
+@needs_numba
+@pytest.mark.parametrize("tolerance", [0.8, 2.5, 10, np.inf])
+def test_other_tolerances_are_left_to_the_tree(tolerance):
+    tree = Renderer(CAMERA, PANE, tolerance=tolerance).sequence().plan(drops(3.4e-3))
+    assert same(plan(3.4e-3, tolerance=tolerance), tree)
+
+
+def test_without_loops_it_is_the_tree(monkeypatch):
+    monkeypatch.setattr(compiled, "available", lambda: False)
+    assert same(plan(2.5e-3), Renderer(CAMERA, PANE).sequence().plan(drops(2.5e-3)))
+
+
+@needs_numba
+@pytest.mark.parametrize("way", [{}, {"lasting": True}, {"tolerance": 0.4}, {"tolerance": 2.4}])
+def test_what_taps_take_when_they_are_ready(way):
+    """Of memory, against the arrays that the loop is given."""
+    held = plan(2.2e-3, **way)._paste_all
+    assert held._is_kept
+    found = sum(
+        part.nbytes
+        for cell in held._kept
+        for part in (cell.pieces, cell.soft, cell.pixels, cell.most, cell.places, cell.weights, cell.roundings)
+    )
+    counts = np.concatenate([table.counts for table in held.tables])
+    expected = np.where(counts > FEW, PAIRED, READY) @ counts
+    assert 0.6 * expected < found < 1.25 * expected
