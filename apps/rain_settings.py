@@ -163,11 +163,10 @@ class Rain:
     def plan(self, image: Image, name: str) -> tuple[Plan, Met | None]:
         """Drops for an image, traced; and how the PSNR was met."""
         size: Size = (image.shape[1], image.shape[0])
-        renderer = self.renderer(size)
         if self.drop_list:
-            return renderer.plan(self.drop_list[1]), None
+            return self.renderer(size).plan(self.drop_list[1]), None
         if self.psnr is None or self.share is not None:
-            return renderer.plan(self.standing(self.drops(name, size), name, size)), None
+            return self._once(self.drops(name, size), name, size), None
         nested = self.nested(name, size)
         return self._meeting(self.psnr, nested, image, name)
 
@@ -176,7 +175,11 @@ class Rain:
         size: Size = (image.shape[1], image.shape[0])
         nested = self.nested(name, size)
         drops = nested.first(share * len(nested.drops))
-        return psnr_under(self.renderer(size).plan(self.standing(drops, name, size)), image)
+        return psnr_under(self._once(drops, name, size), image)
+
+    def _once(self, drops: Drops, name: str, size: Size) -> Plan:
+        """Drops of one image, traced: it takes no longer to find what draws many frames sooner."""
+        return self.renderer(size).told(False).plan(self.standing(drops, name, size))
 
     def _meeting(self, target: float, nested: NestedRain, image: Image, name: str) -> tuple[Plan, Met]:
         size: Size = (image.shape[1], image.shape[0])
@@ -185,7 +188,7 @@ class Rain:
             raise ValueError("the pane is so small that no drop fell on it; no PSNR can be met")
 
         def psnr_of(amount: float) -> float:
-            plan = self.renderer(size).plan(self.standing(nested.first(amount), name, size))
+            plan = self._once(nested.first(amount), name, size)
             value = psnr_under(plan, image)
             if not plans or abs(value - target) < abs(best[0] - target):
                 plans.clear()

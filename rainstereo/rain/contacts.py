@@ -9,6 +9,8 @@ from scipy.spatial import KDTree
 
 from rainstereo.types import Array, Indices, Mask
 
+TOGETHER = 1 << 13  # circles whose neighbours are looked for at a time: lists of those take much memory
+
 
 def touching(x: Array, y: Array, radius: Array, of: Mask | None = None) -> tuple[Indices, Indices]:
     """Pairs i, j, (P,) each, of circles that overlap: distance of the centres below the sum of the radii; each once.
@@ -24,18 +26,18 @@ def touching(x: Array, y: Array, radius: Array, of: Mask | None = None) -> tuple
     everyone = [np.flatnonzero(octave == k) for k in np.flatnonzero(np.bincount(octave))]
     trees = [KDTree(points[rows], balanced_tree=False) for rows in everyone]
     for rows in everyone:
-        some = rows[asked[rows]]
-        if not some.size:
-            continue
-        tree = KDTree(points[some], balanced_tree=False)
-        for others, neighbours in zip(everyone, trees, strict=True):
-            reach = float(radius[some].max() + radius[others].max())
-            near = tree.sparse_distance_matrix(neighbours, reach, output_type="ndarray")
-            i, j = some[near["i"]], others[near["j"]]
-            # a pair of two that are asked for turns up twice
-            meets = (near["v"] < radius[i] + radius[j]) & ((i < j) | ~asked[j])
-            first.append(i[meets])
-            second.append(j[meets])
+        taking_part = rows[asked[rows]]
+        for start in range(0, len(taking_part), TOGETHER):
+            some = taking_part[start : start + TOGETHER]
+            tree = KDTree(points[some], balanced_tree=False)
+            for others, neighbours in zip(everyone, trees, strict=True):
+                reach = float(radius[some].max() + radius[others].max())
+                near = tree.sparse_distance_matrix(neighbours, reach, output_type="ndarray")
+                i, j = some[near["i"]], others[near["j"]]
+                # a pair of two that are asked for turns up twice
+                meets = (near["v"] < radius[i] + radius[j]) & ((i < j) | ~asked[j])
+                first.append(i[meets])
+                second.append(j[meets])
     return np.concatenate(first), np.concatenate(second)
 
 

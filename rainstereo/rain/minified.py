@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import pairwise
 
@@ -121,11 +121,6 @@ class Minifier:
     def __post_init__(self) -> None:
         self.clear = _clear_map(self.camera, self.chamber)
 
-    def of_frame(self, batches: Sequence[Batch]) -> list[Lookups]:
-        """`lookups` of all batches of a frame, which if they are large are found as if it was worth much time."""
-        crowded = not self.lasting and self._is_crowded(batches)
-        return (replace(self, lasting=True) if crowded else self).lookups(batches)
-
     def lookups(self, batches: Sequence[Batch]) -> list[Lookups]:
         """What every pixel of the batches that a drop covers looks at."""
         tables: list[Lookups] = []
@@ -136,6 +131,7 @@ class Minifier:
 
         if sum(len(batch.pixels) for batch in batches) > MANY:
             compile_ahead("lasting" if self.lasting else "default")
+            give_back()  # what it took to find the batches
         for table in self._one_by_one(batches):
             every += len(table.texels)
             if size + table.size > self._joined:  # before the next ones come: the memory of these serves them
@@ -154,14 +150,14 @@ class Minifier:
             give_back()
         return tables
 
-    def _is_crowded(self, batches: Sequence[Batch]) -> bool:
-        """Whether the tree's texels would be too many for the time of a frame, and there are loops to find fewer."""
+    def is_crowded(self, batches: Sequence[Batch]) -> bool:
+        """Whether the tree's texels of a frame would be too many for its time, and there are loops to find fewer."""
         room = CROWDED * self.camera.width * self.camera.height
         suits = self.tolerance >= STRICT and rays_along(self.tolerance) == rays_along(STRICT)
         if not (suits and compiled.available()) or sum(len(batch.pixels) for batch in batches) <= room:
             return False
         for part in (part for batch in batches for part in batch.parts()):
-            room -= np.count_nonzero(_kind(self.traced(part, RAYS)) == LIT)
+            room -= np.count_nonzero(self._kinds(part) == LIT)
         return room < 0
 
     def _narrow(self, tables: list[Lookups], wide: list[Lookups]) -> None:
@@ -202,10 +198,10 @@ class Minifier:
             for batch in batches:
                 yield partial(self._of_rows, batch, np.arange(len(batch.pixels)), side)
             return
-        kinds = [_kind(self.traced(batch, RAYS)) for batch in batches]
+        kinds = [self._kinds(batch) for batch in batches]
         ends = np.cumsum([len(kind) for kind in kinds])[:-1]
-        pixels = np.concatenate([batch.pixels for batch in batches])
-        edges, outlines = (np.split(found, ends) for found in self.edges(pixels, np.concatenate(kinds)))
+        found = self.edges(np.concatenate([batch.pixels for batch in batches]), np.concatenate(kinds))
+        edges, outlines = (np.split(each, ends) for each in found)
         for batch, kind, edge, outline in zip(batches, kinds, edges, outlines, strict=True):
             fine = outline & self.lasting
             for some, more in ((~fine & (edge | (kind == LIT)), 1), (fine, OUTLINE)):
@@ -219,6 +215,11 @@ class Minifier:
 
     def _of_rows(self, batch: Batch, rows: Indices, side: int) -> Lookups:
         return self._look(batch, rows, self.traced(batch, side, rows))
+
+    def _kinds(self, batch: Batch) -> Status:
+        """What the pixels of a batch show, (M,): see `_kind`."""
+        firsts = range(0, len(batch.pixels), TOGETHER)
+        return np.concatenate([_kind(self.traced(batch, RAYS, slice(k, k + TOGETHER))) for k in firsts])
 
     # -- tracing -------------------------------------------------------------------------------------------------------
 

@@ -270,8 +270,11 @@ class CapTable:
             found: tuple[Indices, Indices] = meeting(self.circles)
             return found
         one, other = touching(*np.ascontiguousarray(self.circles.T))
-        one, other = np.concatenate([one, other]), np.concatenate([other, one])
-        return np.bincount(one, minlength=len(self.caps)), other[np.lexsort((other, one))]
+        count = len(self.caps)
+        pairs = np.concatenate([one * count + other, other * count + one])
+        del one, other  # much memory, of drops that hide one another
+        pairs.sort()
+        return np.bincount(pairs // count, minlength=count), pairs % count
 
     # -- drawn ---------------------------------------------------------------------------------------------------------
 

@@ -32,7 +32,7 @@ LOOSE = 2.5
 """Times the usual step between its rays, all along it, that a pixel's rays may span as one."""
 JUMP = 4.0
 """Times its neighbour's that the step of a ray may be whose other neighbour is dark."""
-APART = 8  # texels along a pixel that sees several places far apart, about
+APART = 5  # texels along a pixel that sees several places far apart, about
 MERGES = 3
 ALIGNED = 1 << MERGES
 UNIT = 1024

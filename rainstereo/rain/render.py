@@ -1,15 +1,13 @@
 """Rain on an image: drops of any kind, through a pinhole or a lens, planned once and applied to any number of frames.
 
 Drops whose surroundings in the image meet are traced together, whatever the face they are on; the others on their own.
-A plan holds what each covered pixel looks at (`lookups`), or blurred layers (`defocus`); pixels that no drop covers are
-copied.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -23,22 +21,17 @@ from rainstereo.layer import depth_of
 from rainstereo.panel_plane import room
 from rainstereo.patch import BORDERS
 from rainstereo.thin_lens import ThinLens
-from rainstereo.types import Array, Image, Indices, Mask
+from rainstereo.types import Image, Indices
 
-from . import drop_list, linear_light
+from . import drop_list
 from .blurred import BlurredLayer, by_disc, nearest
 from .cap_tier import OWN, CapTiers, DropTier
 from .drops import Drops
 from .far_caps import are_far_caps
-from .free_memory import give_back
-from .looks import Looks
-from .lookups import Lookups
 from .minified import Batch, Minifier
 from .moving_caps import CapScene, CapTable
 from .outlines import Outlines
-from .paste import Paste
-from .paste_moving import PasteMoving
-from .rendered import Rendered
+from .plan import Plan
 from .single_ray import SingleRay
 from .streaks import Streak
 from .surround import Surround
@@ -82,10 +75,10 @@ class Renderer:
     what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).
     lasting: whether a plan serves hundreds of frames: planned in twice the time (fifty times, without numba), of a
     fifth of the texels (`pursuit`), and with finer rays at outlines, so that drops are within the tolerance of 1024
-    rays a pixel, of which 64 are off by nearly as much. With numba and a tolerance from 0.9 to 2.5 all plans but a
-    sequence's are so of drops through which more than 0.3 of the frame's pixels look. 16-bit and floating point
-    frames may then show values a little beyond the image's. With numba any plan of drops at rest is made by up to
-    four threads, if OpenCV may use as many (`cv2.setNumThreads`); their number changes no bit.
+    rays a pixel, of which 64 are off by nearly as much. None: with numba, tolerances from 0.9 to 2.5, and drops through
+    which more than 0.3 of the frame's pixels look, but not in sequences; a plan's renderer tells. 16-bit and floating
+    point frames may then show values a little beyond the image's. With numba any plan of drops at rest is made by up
+    to four threads, if OpenCV may use as many (`cv2.setNumThreads`); their number changes no bit.
     """
 
     camera: Camera
@@ -96,7 +89,7 @@ class Renderer:
     border: str | Surround = "mirror"
     linear_light: bool = False
     moving: bool = False
-    lasting: bool = False
+    lasting: bool | None = None
 
     def __post_init__(self) -> None:
         if self.moving and self.lasting:
@@ -120,7 +113,19 @@ class Renderer:
         if tables is not None:
             return Plan(self, everyone, tables, tuple(layers))
         groups = self.groups(sharp)
-        return Plan(self, everyone, tuple(self.lookups(groups, range(len(groups)), True)), tuple(layers))
+        if self.moving:
+            return Plan(self, everyone, tuple(self.lookups(groups, range(len(groups)))), tuple(layers))
+        batches = self._batches(groups, np.arange(len(groups)))
+        renderer = self.told(self.lasting is None and self._minifier.is_crowded(batches))
+        return Plan(renderer, everyone, tuple(renderer._minifier.lookups(batches)), tuple(layers))
+
+    def told(self, lasting: bool) -> Renderer:
+        """The same, told whether plans last, unless it was or drops move."""
+        return self if self.moving or self.lasting is not None else self._told[lasting]
+
+    @cached_property
+    def _told(self) -> dict[bool, Renderer]:
+        return {lasting: replace(self, lasting=lasting) for lasting in (False, True)}
 
     def tier(self, drop: Drop) -> DropTier:
         """By which optics a sharp drop is drawn: its own, or, if it moves and the bound allows it, those of its cap."""
@@ -130,7 +135,7 @@ class Renderer:
         """Plans of frame after frame, in which what does not change is traced once. motion: for `Sequence.at`."""
         from . import sequence  # which needs this module
 
-        return sequence.Sequence(self, motion)
+        return sequence.Sequence(self.told(False), motion)
 
     def split(
         self, drops: Sequence[Drop], known: Mapping[Key, BlurredLayer] | None = None
@@ -159,14 +164,13 @@ class Renderer:
         outlines = Outlines.of(drops, self.camera, self.chamber)
         return [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in outlines.groups()]
 
-    def lookups(self, groups: Sequence[Group], numbers: Iterable[int], whole: bool = False) -> list[Any]:
-        """What pixels look at in groups of drops, which get these numbers. whole: whether it is all of a frame."""
+    def lookups(self, groups: Sequence[Group], numbers: Iterable[int]) -> list[Any]:
+        """What pixels look at in groups of drops, which get these numbers."""
         if not groups:
             return []
         given = np.fromiter(numbers, dtype=np.intp)
         if not self.moving:
-            find = self._minifier.of_frame if whole else self._minifier.lookups
-            return find(self._batches(groups, given))
+            return self._minifier.lookups(self._batches(groups, given))
         groups = [Group(tuple(self._cap_tiers.drawn(group.drops)), group.outlines) for group in groups]
         tables, others = list[Any](), list[int]()
         for panel, some in _by_far_face(groups).items():
@@ -243,7 +247,8 @@ class Renderer:
     @cached_property
     def _minifier(self) -> Minifier:
         return Minifier(
-            self.camera, self.chamber, self.depth, self.tolerance, self.scene_size, self.shift, self.fold, self.lasting
+            self.camera, self.chamber, self.depth, self.tolerance, self.scene_size, self.shift, self.fold,
+            bool(self.lasting),
         )  # fmt: skip
 
     @cached_property
@@ -306,112 +311,6 @@ class Renderer:
             return cls(**settings), drops
         except TypeError as error:
             raise ValueError(f"the drop list's settings are not a renderer's: {error}") from None
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """Drops traced for one camera: what serves every frame of a scene while they do not change.
-
-    tables: of the sharp drops. layers: of the blurred ones, the farthest first.
-    """
-
-    renderer: Renderer
-    drops: Sequence[Drop]
-    tables: Sequence[Lookups | Looks | CapTable] = field(repr=False)
-    layers: Sequence[BlurredLayer] = field(repr=False)
-
-    def apply(self, image: Image) -> Image:
-        """A copy of the clear image's frame with drops: (H, W[, 1 to 4]) uint8, uint16 or float32; never changed."""
-        frame = self.renderer.framed(image)
-        sharp = self.tables and not self.layers and not self.renderer.linear_light and frame.shape == image.shape
-        if sharp and isinstance(self._paste_all, PasteMoving) and (drawn := self._paste_all.drawn(image)) is not None:
-            return drawn
-        out = frame.copy("C")
-        if not self.tables and not self.layers:
-            return out
-        if self.renderer.linear_light:
-            self._in_light(image, out)
-        else:
-            self._paste(np.ascontiguousarray(image), out)
-        return out
-
-    def let_go(self) -> None:
-        """Give up what was made of the tables for frames; if there is another, it is made anew."""
-        if self.__dict__.pop("_paste_all", None) is not None:
-            give_back()
-
-    def _paste(self, scene: Image, out: Image) -> None:
-        """Put everything over a frame; scene: the clear image, contiguous."""
-        paste = self._paste_all
-        below = np.ascontiguousarray(self.renderer.framed(scene)) if paste.soft.size else out
-        paste.paste(scene, below, out)
-        for layer in self.layers:
-            layer.paste(scene, out)
-
-    @cached_property
-    def _paste_all(self) -> Paste | PasteMoving:
-        if self.renderer.moving:
-            return PasteMoving(self.tables)
-        tables = [table for table in self.tables if isinstance(table, Lookups)]
-        return Paste(tables, self.renderer.scene_size, self.renderer.camera.width)
-
-    def _in_light(self, image: Image, out: Image) -> None:
-        """The same, averaging light; only pixels that drops touch are converted back."""
-        scene = linear_light.decoded(np.ascontiguousarray(image))
-        light = np.ascontiguousarray(self.renderer.framed(scene)).copy()
-        self._paste(scene, light)
-        touched = self.opacity > 0
-        out[touched] = linear_light.encoded(light[touched], out.dtype)
-
-    def render(self, image: Image) -> Rendered:
-        """`apply`, with everything that is known about the pixels."""
-        renderer = self.renderer
-        return Rendered(
-            self.apply(image), self.opacity > 0, self.opacity, self.displacement, self.unknown, self.drops,
-            renderer.settings,
-        )  # fmt: skip
-
-    @cached_property
-    def tiers(self) -> tuple[DropTier, ...]:
-        """By which optics each drop is drawn, in the order of `drops`, and what that may be wrong by."""
-        if not self.renderer.moving:
-            return (OWN,) * len(self.drops)
-        blurred = {id(drop) for layer in self.layers for drop in layer.drops}
-        return tuple(OWN if id(drop) in blurred else self.renderer.tier(drop) for drop in self.drops)
-
-    @cached_property
-    def opacity(self) -> Array:
-        """(H, W) float32: share of each pixel that drops hide."""
-        clear: Image = np.ones(self.renderer.camera.size[::-1], dtype=np.float32)
-        for table in self.tables:
-            clear.ravel()[table.pixels] = table.clear
-        for layer in self.layers:
-            rows, columns, opacity = layer.opacity
-            clear[rows, columns] *= 1 - opacity
-        return np.asarray(1 - clear)
-
-    @cached_property
-    def displacement(self) -> Array:
-        """(H, W, 2) float32; see `Rendered`."""
-        width, height = self.renderer.camera.size
-        moved: Image = np.zeros((height, width, 2), dtype=np.float32)
-        for table in self.tables:
-            moved.reshape(-1, 2)[table.pixels] = table.displacement
-        for layer in self.layers:
-            rows, columns, hidden, displacement = layer.displacement
-            moved[rows, columns][hidden] = displacement[hidden]
-        return moved
-
-    @cached_property
-    def unknown(self) -> Mask:
-        """(H, W): pixels that show something beyond the image."""
-        found = np.zeros(self.renderer.camera.size[::-1], dtype=np.bool_)
-        for table in self.tables:
-            found.ravel()[table.pixels] = table.unknown
-        for layer in self.layers:
-            rows, columns, unknown = layer.unknown
-            found[rows, columns] |= unknown
-        return found
 
 
 def _by_far_face(groups: Sequence[Group]) -> dict[int | None, list[int]]:

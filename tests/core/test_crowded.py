@@ -49,6 +49,17 @@ def test_drops_that_many_pixels_look_through(radius):
 
 
 @needs_numba
+@pytest.mark.parametrize("lasting", [None, True, False])
+def test_a_drop_list_makes_the_same_plan(lasting):
+    """Also where the renderer was not told, or drops were a sequence's, and so were planned in another way."""
+    renderer, image = Renderer(CAMERA, PANE, lasting=lasting), np.zeros((*SIZE[::-1], 3), np.uint8)
+    for planned in (renderer.plan(drops(3.4e-3)), renderer.sequence().plan(drops(3.4e-3))):
+        again, listed = Renderer.from_json(planned.render(image).drops_json())
+        assert again.lasting is planned.renderer.lasting is not None
+        assert same(again.plan(listed), planned)
+
+
+@needs_numba
 @pytest.mark.parametrize("tolerance", [0.8, 2.5, 10, np.inf])
 def test_other_tolerances_are_left_to_the_tree(tolerance):
     tree = Renderer(CAMERA, PANE, tolerance=tolerance).sequence().plan(drops(3.4e-3))
