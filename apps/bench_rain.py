@@ -69,7 +69,7 @@ def build(seed: int, quick: bool) -> Stage:
         },
         (
             f"The default aims at 1 gray level RMS inside drops, against {SIDE**2} rays a pixel. These drops shrink "
-            "the scene some 30 to 50 times, so that 64 rays a pixel are themselves off by 0.7 to 1.4 gray levels.",
+            "the scene some 30 to 50 times, so that 64 rays a pixel are themselves off by 0.7 to 1.5 gray levels.",
             f"`coarse` allows {COARSE:g} gray levels: about five texels a pixel.",
             "A cover is the share of the frame's pixels that drops hide, as rendered.",
             "Memory-bound work: on a busy machine trust the ratios within a round, not the milliseconds.",

@@ -50,7 +50,7 @@ EXTENTS = ((0.75, 33), (2.5, 17), (6.0, 9), (60.0, 5), (math.inf, 3))
 WORTH = 0.003
 """Of a texel that is saved, in square gray levels, at a tolerance of 1 gray level; as its square. With this, a few
 large drops (the tests') are within the tolerance of 576 rays a pixel, and of 64, which are wrong by 0.6 to 0.8 gray
-levels there. In rain on photographs (the benchmark's) 64 are wrong by 0.7 to 1.4, and drops within 1.1 of 1024."""
+levels there. In rain on photographs (the benchmark's) 64 are wrong by 0.7 to 1.5, and drops within 1.1 of 1024."""
 FINER_WORTH, EACH = 0.008, 0.3
 """The same in plans that last, and of a texel more in `Pursuit`: within the tolerance of 1024 rays a pixel."""
 DEAREST = 4.0
