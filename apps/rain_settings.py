@@ -178,7 +178,7 @@ class Rain:
         return psnr_under(self._once(drops, name, size), image)
 
     def _once(self, drops: Drops, name: str, size: Size) -> Plan:
-        """Drops of one image, traced: it takes no longer to find what draws many frames sooner."""
+        """Drops of one image, traced for it alone: a search for texels that pays over many frames would not pay."""
         return self.renderer(size).told(False).plan(self.standing(drops, name, size))
 
     def _meeting(self, target: float, nested: NestedRain, image: Image, name: str) -> tuple[Plan, Met]:
