@@ -73,8 +73,8 @@ class Sequence:
 
     @cached_property
     def _plans(self) -> Plans:
-        """Makes plans, and traces what has not moved only once."""
-        return self.rain.renderer(self.drive.size).sequence()
+        """Makes plans, and traces what has not moved only once; wherever it begins, in the same way."""
+        return self.rain.renderer(self.drive.size).told(False).sequence()
 
     def _moving(self, renderer: Renderer) -> Motion:
         if self._motion is None:

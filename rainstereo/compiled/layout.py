@@ -13,5 +13,4 @@ DRAW, COUNT, FILL = 0, 1, 2
 """What the loops over caps do: draw a frame, count its pixels and taps, or write them down."""
 LANES = 8  # pixels whose taps are summed together
 PLACES = 1 << 16  # of a cell (`rain.cells`): a place takes 16 bits
-PLACE = 10  # bits of a texel's place in a window (`rain.windows`)
 MOST_RAYS = 1024  # of a pixel, that `ray_steps` has room for

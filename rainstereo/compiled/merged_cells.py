@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -9,21 +10,21 @@ import numpy as np
 from .compile import compiled, inlined
 
 U = np.uint64
-ZERO, HALF, QUARTER = np.float32(0), np.float32(0.5), np.float32(0.25)
+ZERO, HALF, QUARTER, ONE = np.float32(0), np.float32(0.5), np.float32(0.25), np.float32(1)
 
 
 @compiled
 def merge(
     x: Any, y: Any, weights: Any, right_x: Any, right_y: Any, below_x: Any, below_y: Any, level: Any, column: Any,
-    row: Any, order: Any, places: Any, merges: int, side: int, uneven: Any, worth: Any, dear: Any, few: int,
+    row: Any, most: Any, order: Any, places: Any, merges: int, side: int, uneven: Any, worth: Any, dear: Any, few: int,
     starts: Any, wide: Any, high: Any, texel: Any, weight: Any, counts: Any, error: Any,
 ) -> None:  # fmt: skip
     """Write texels and their weights, (T,) int64 and float32, of one pixel after the other, and how many, (M,).
 
     x, y, weights, right_x ...: (K, M) float32 places of rays, their weights, and steps to the next ray. level, column,
-    row: (M,) int64 of windows, of side x side cells. order: (side^2,) int32, see `rain.quadtree._order`; places:
-    (merges + 1, 2, side^2) int64, `_places`. uneven: (L,) float32 of levels. worth: of a texel, and of levels below
-    `few`, dear. starts, wide, high: of levels. error: (M,) float64.
+    row: (M,) int64 of windows, of side x side cells. most: float32, see `rain.quadtree.POINTS`. order: (side^2,) int32,
+    see `rain.quadtree._order`; places: (merges + 1, 2, side^2) int64, `_places`. uneven: (L,) float32 of levels. worth:
+    of a texel, and of levels below `few`, dear. starts, wide, high: of levels. error: (M,) float64.
     """
     cells, total = np.empty(side * side, np.float64), U(0)
     lost_all: Any = 0.0
@@ -32,12 +33,9 @@ def merge(
     for pixel in range(U(len(level))):
         own, left, top = level[pixel], column[pixel], row[pixel]
         cells[:] = 0.0
-        if own == 0:
-            around(x, y, weights, pixel, left, top, side, order, cells)
-        else:
-            inside(
-                x, y, weights, right_x, right_y, below_x, below_y, pixel, own, left, top, side, order, cells
-            )  # fmt: skip
+        spread(
+            x, y, weights, right_x, right_y, below_x, below_y, pixel, own, left, top, side, most, order, cells
+        )  # fmt: skip
         for i in range(side * side):
             values[i], closed[i] = np.float32(cells[i]), False
         before, count, lost_all = total, side * side, 0.0
@@ -75,37 +73,42 @@ def merge(
 
 
 @inlined
-def around(x: Any, y: Any, weights: Any, pixel: Any, left: Any, top: Any, side: int, order: Any, cells: Any) -> None:
-    """Each ray's share to the four cells around it, as it is looked up; the rest comes after all of these."""
-    end = np.float32(side - 1)
-    for corner in range(4):
-        for ray in range(U(len(x))):
-            share = np.float64(weights[ray, pixel])
-            u: Any = min(max((x[ray, pixel] + HALF) - np.float32(left + 0.5), ZERO), end)
-            v: Any = min(max((y[ray, pixel] + HALF) - np.float32(top + 0.5), ZERO), end)
-            j: Any = min(np.int64(u), side - 2)
-            i: Any = min(np.int64(v), side - 2)
-            a, b = np.float64(u) - j, np.float64(v) - i
-            part = (a if corner % 2 else 1 - a) * (b if corner // 2 else 1 - b)
-            cells[order[(i + corner // 2) * side + j + corner % 2]] += part * share
-
-
-@inlined
-def inside(
+def spread(
     x: Any, y: Any, weights: Any, right_x: Any, right_y: Any, below_x: Any, below_y: Any, pixel: Any, level: Any,
-    left: Any, top: Any, side: int, order: Any, cells: Any,
+    left: Any, top: Any, side: int, most: Any, order: Any, cells: Any,
 ) -> None:  # fmt: skip
-    """Four points of each ray's part of the pixel to the cells that they are in."""
-    scale, end = np.float32(0.5**level), np.float32(side - 0.5)
-    for point in range(4):
-        a, b = QUARTER if point % 2 else -QUARTER, QUARTER if point // 2 else -QUARTER
-        for ray in range(U(len(x))):
-            u = (x[ray, pixel] + HALF) * scale - np.float32(left + 0.5)
-            v = (y[ray, pixel] + HALF) * scale - np.float32(top + 0.5)
-            u = u + a * (right_x[ray, pixel] * scale) + b * (below_x[ray, pixel] * scale) + HALF
-            v = v + a * (right_y[ray, pixel] * scale) + b * (below_y[ray, pixel] * scale) + HALF
-            j, i = np.int64(min(max(u, ZERO), end)), np.int64(min(max(v, ZERO), end))
-            cells[order[i * side + j]] += np.float64(QUARTER * weights[ray, pixel])
+    """Points of each ray's part of the pixel, most x most or fewer, to the cells: see `rain.quadtree._spread`."""
+    scale, end = np.float32(0.5**level), np.float32(side - 1) if level == 0 else np.float32(side - 0.5)
+    away = np.float32(0) if level == 0 else HALF
+    wide = U(side)
+    for ray in range(U(len(x))):
+        share = weights[ray, pixel]
+        if share == ZERO:
+            continue
+        right_u, right_v = right_x[ray, pixel] * scale, right_y[ray, pixel] * scale
+        below_u, below_v = below_x[ray, pixel] * scale, below_y[ray, pixel] * scale
+        across = min(max(np.float32(math.ceil(max(abs(right_u), abs(right_v)))), ONE), most)
+        along = min(max(np.float32(math.ceil(max(abs(below_u), abs(below_v)))), ONE), most)
+        first_u = (x[ray, pixel] + HALF) * scale - np.float32(left + 0.5) + away
+        first_v = (y[ray, pixel] + HALF) * scale - np.float32(top + 0.5) + away
+        part = np.float64(share / (across * along))
+        for n in range(U(along)):
+            b = (np.float32(n) + HALF) / along - HALF
+            for m in range(U(across)):
+                a = (np.float32(m) + HALF) / across - HALF
+                u = min(max(first_u + a * right_u + b * below_u, ZERO), end)
+                v = min(max(first_v + a * right_v + b * below_v, ZERO), end)
+                j, i = U(u), U(v)
+                if level > 0:
+                    cells[order[i * wide + j]] += part
+                    continue
+                j, i = min(j, wide - U(2)), min(i, wide - U(2))
+                s, t = np.float64(u) - np.float64(j), np.float64(v) - np.float64(i)
+                cell = i * wide + j
+                cells[order[cell]] += (1 - s) * (1 - t) * part
+                cells[order[cell + U(1)]] += s * (1 - t) * part
+                cells[order[cell + wide]] += (1 - s) * t * part
+                cells[order[cell + wide + U(1)]] += s * t * part
 
 
 __all__ = ["merge"]

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from .compile import compiled
-from .layout import PLACE
 
 U = np.uint64
 
@@ -19,11 +18,11 @@ def places(
     """Write numbers of texels, (T,).
 
     corners: (M,) first texel of rows' windows. starts, wide: (levels + 1,), (levels,) of levels, first texel and width.
-    above: (2^PLACE,) levels above its window's of each place; offsets: (levels, 2^PLACE) from the corner there to it.
+    above: (2^place,) levels above its window's of each place; offsets: (levels, 2^place) from the corner there to it.
     counts: (M,) of taps. codes: (T,) uint16.
     """
     there = np.empty(U(np.max(above)) + U(1), np.int32)
-    last = U(len(wide)) - U(1)
+    last, mask = U(len(wide)) - U(1), U(len(above)) - U(1)
     tap = U(0)
     for row in range(U(len(counts))):
         if counts[row] == 0:
@@ -37,6 +36,6 @@ def places(
             there[k] = starts[level] + (down >> k) * wide[level] + (along >> k)
         of_level = offsets[finest]
         for each in range(tap, tap + U(counts[row])):
-            place = U(codes[each]) & U((1 << PLACE) - 1)
+            place = U(codes[each]) & mask
             found[each] = of_level[place] + there[U(above[place])]
         tap += U(counts[row])

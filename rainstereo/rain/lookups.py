@@ -19,7 +19,7 @@ from rainstereo import compiled
 from rainstereo.types import Array, Indices, Mask
 
 from .quadtree import Taps
-from .windows import Column, PairTaps, WindowTaps
+from .windows import NARROW, Column, PairTaps, Window, WindowTaps
 
 JOINED = 1 << 20  # taps up to which tables are joined: both stand in memory meanwhile
 ROW = 8  # taps that the rest of a row is as dear as
@@ -90,14 +90,14 @@ class Lookups:
             return self
         kept, held = self.of_rows(keep), getattr(self.texels, "taps", None)
         if isinstance(held, WindowTaps):
-            return kept.narrow(held.size)[0]
+            return kept.narrow(held.size, held.window)[0]
         return kept if held is None else kept.paired()
 
-    def narrow(self, size: tuple[int, int]) -> tuple[Lookups, Lookups]:
+    def narrow(self, size: tuple[int, int], window: Window = NARROW) -> tuple[Lookups, Lookups]:
         """The rows whose taps fit into windows, held so, and the others. size: (width, height) of the scene's image."""
         if isinstance(self.texels, Column):
             return self, self.of_rows(np.zeros(len(self.pixels), dtype=np.bool_))
-        taps, fits = WindowTaps.of(size, self.counts, self.texels, self.weights)
+        taps, fits = WindowTaps.of(size, self.counts, self.texels, self.weights, window)
         held = {name: a if fits.all() else a[fits] for name, a in self.columns() if name not in OF_TAPS}
         held |= {name: Column(taps, name) for name in OF_TAPS}
         return Lookups(**held | {"counts": taps.counts}), self.of_rows(~fits)

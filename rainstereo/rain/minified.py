@@ -2,9 +2,9 @@
 
 A drop shows the scene small: neighbouring pixels may look 50 pixels apart. A pixel's value is the mean over its area,
 taken here from `rays_along` squared rays, each of which stands for its part of the area (`pursuit`, `quadtree`). Two
-rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more. In plans that
-last there are twice as many along a side at the outline of a drop, since they also tell how much of the pixel the drop
-hides: of 8 x 8 that share is wrong by 0.013 or so, which is more gray levels than all else.
+rays a side tell first which pixels a drop covers, and which of them are dark: most of those need no more. At a drop's
+outline there are twice as many along a side, since they also tell how much of the pixel the drop hides: of 8 x 8 that
+share is wrong by 0.013 or so, which is more gray levels than all else.
 """
 
 from __future__ import annotations
@@ -34,23 +34,27 @@ from .ordered_threads import in_order
 from .pursuit import Pursuit, forget
 from .quadtree import Quadtree
 from .samples import Samples
+from .windows import WIDE
 
 RAYS = 2  # along a pixel's side, to begin with
 CHUNK = 4096  # pixels traced at a time with all their rays
 TOGETHER = 1 << 16  # pixels that are held at a time
 OUTLINE = 2
-"""Times as many rays along a side at the outline of a drop, for plans that last."""
+"""Times as many rays along a side at the outline of a drop."""
 CLEAR_STEP = 8
 LARGE = 1 << 22  # taps of a plan beyond which they are held in less memory, for a little more time in each frame
-CROWDED = 0.3
+CROWDED = 0.27
 """Share of a frame's pixels: drops through which more look at the scene are planned as those that last are."""
 NOTHING, DARK, LIT = 0, 1, 2  # of a pixel
-EXTENTS = ((0.75, 33), (2.5, 17), (6.0, 9), (60.0, 5), (math.inf, 3))
+EXTENTS = ((2.5, 33), (6.0, 9), (60.0, 5), (math.inf, 3))
 """Texels that a pixel may span, up to a tolerance."""
-WORTH = 0.003
+ALONG = ((0.75, 16), (2.5, 8), (math.inf, 4))
+"""Rays along a pixel's side, below a tolerance."""
+WORTH = 0.0015
 """Of a texel that is saved, in square gray levels, at a tolerance of 1 gray level; as its square. With this, a few
-large drops (the tests') are within the tolerance of 576 rays a pixel, and of 64, which are wrong by 0.6 to 0.8 gray
-levels there. In rain on photographs (the benchmark's) 64 are wrong by 0.7 to 1.5, and drops within 1.1 of 1024."""
+large drops (the tests') are within 0.65 gray levels of 576 rays a pixel, and within the tolerance of 64, which are
+wrong by 0.6 to 0.8 there. In rain on photographs (the benchmark's) 64 are wrong by 0.7 to 1.5, and drops within 0.6
+of 1024."""
 FINER_WORTH, EACH = 0.008, 0.3
 """The same in plans that last, and of a texel more in `Pursuit`: within the tolerance of 1024 rays a pixel."""
 DEAREST = 4.0
@@ -97,7 +101,7 @@ class Batch:
 
 def rays_along(tolerance: float) -> int:
     """Rays along a pixel's side."""
-    return 8 if tolerance < 2.5 else 4 if tolerance < math.inf else RAYS
+    return next((rays for below, rays in ALONG if tolerance < below), RAYS)
 
 
 @dataclass(eq=False)
@@ -145,7 +149,7 @@ class Minifier:
         tables += self._ordered(small)
         if every > LARGE:
             self._narrow(tables, wide)
-            tables += [table.paired() for table in self._ordered(wide)]
+            tables += self._wider(wide)
             forget()
             give_back()
         return tables
@@ -170,8 +174,13 @@ class Minifier:
             if len(rest.pixels):
                 wide.append(rest)
         if sum(table.size for table in wide) > JOINED:
-            tables += [table.paired() for table in self._ordered(wide)]
-            wide.clear()
+            tables += self._wider(wide)
+
+    def _wider(self, tables: list[Lookups]) -> Iterator[Lookups]:
+        """Those that do not fit into narrow windows in wide ones, or in pairs; empties the list."""
+        for table in self._ordered(tables):
+            held, rest = table.narrow(self.source_size, WIDE)
+            yield from (each for each in (held, rest.paired()) if len(each.pixels))
 
     def _ordered(self, tables: list[Lookups]) -> list[Lookups]:
         return [table.ordered(self.camera.width) for table in Lookups.joined(tables, self._joined)]
@@ -203,8 +212,7 @@ class Minifier:
         found = self.edges(np.concatenate([batch.pixels for batch in batches]), np.concatenate(kinds))
         edges, outlines = (np.split(each, ends) for each in found)
         for batch, kind, edge, outline in zip(batches, kinds, edges, outlines, strict=True):
-            fine = outline & self.lasting
-            for some, more in ((~fine & (edge | (kind == LIT)), 1), (fine, OUTLINE)):
+            for some, more in ((~outline & (edge | (kind == LIT)), 1), (outline, OUTLINE)):
                 rows = np.flatnonzero(some)
                 for first in range(0, len(rows), CHUNK // more**2):
                     yield partial(self._of_rows, batch, rows[first : first + CHUNK // more**2], more * side)

@@ -1,12 +1,13 @@
 """Which texels of an image and its halves make up a pixel that looks at the scene along many rays.
 
 A drop shows the scene small: the rays of one pixel may spread over fifty pixels of it. Their sum is written as a
-weighted sum of texels, as few as an error allows. Every ray's share goes to the four texels around it, in the finest
-level that holds all of the pixel's rays in a window; then, level by level, four texels become one of the next coarser
-level wherever that costs little: replacing weights w_i by their mean changes the pixel by sum (w_i - mean) I_i, whose
-expected square is about |w - mean|^2 times the `unevenness` of the level. Merging is worth `worth` of square error for
-each texel that it saves, which makes the fewest texels for the error that is left (J. M. Shapiro's trees of wavelet
-coefficients, "Embedded image coding using zerotrees", IEEE TSP 41, 1993, with weights in place of an image).
+weighted sum of texels, as few as an error allows. Every ray's share goes to the texels around it, or, where rays are
+far apart, around points between them, in the finest level that holds all of the pixel's rays in a window; then, level
+by level, four texels become one of the next coarser level wherever that costs little: replacing weights w_i by their
+mean changes the pixel by sum (w_i - mean) I_i, whose expected square is about |w - mean|^2 times the `unevenness` of
+the level. Merging is worth `worth` of square error for each texel that it saves, which makes the fewest texels for the
+error that is left (J. M. Shapiro's trees of wavelet coefficients, "Embedded image coding using zerotrees", IEEE TSP 41,
+1993, with weights in place of an image).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,8 @@ LOOSE = 2.5
 """Times the usual step between its rays, all along it, that a pixel's rays may span as one."""
 JUMP = 4.0
 """Times its neighbour's that the step of a ray may be whose other neighbour is dark."""
+POINTS = 4
+"""Points, a texel apart, but so many at most, along the sides of a parallelogram: a ray's part of the pixel."""
 APART = 5  # texels along a pixel that sees several places far apart, about
 MERGES = 3
 ALIGNED = 1 << MERGES
@@ -153,12 +157,8 @@ class Quadtree:
         for fine in (True, False):
             some = np.flatnonzero((level == 0) == fine)
             if some.size:
-                few = slice(None) if some.size == count else some
-                u, v, share = (columns[:, few] for columns in (*own, weights))
-                if fine:
-                    cells[few] = _around(u, v, share, side)
-                else:
-                    cells[few] = _inside(u, v, share, [step[:, few] * scale[few] for step in steps], side)
+                u, v, share = (columns[:, some] for columns in (*own, weights))
+                cells[some] = _spread(u, v, share, [step[:, some] * scale[some] for step in steps], side, fine)
         uneven, error, found = unevenness(len(sizes(self.size))), np.zeros(count), []
         closed: Mask = np.zeros(cells.shape, dtype=np.bool_)
         for merge in range(MERGES + 1):
@@ -194,7 +194,8 @@ class Quadtree:
         # one kind of array, so that it is compiled once
         a, b, share, *four = (np.ascontiguousarray(each) for each in (x, y, weights, *steps))
         merge(
-            a, b, share, four[0], four[1], four[2], four[3], *window, _order(side), _all_places(side), MERGES, side,
+            a, b, share, four[0], four[1], four[2], four[3], *window,
+            np.float32(POINTS), _order(side), _all_places(side), MERGES, side,
             uneven, prices[0], prices[1], FEW,
             np.array(starts(self.size), dtype=np.int64), wide, high, texel, weight, counts, error,
         )  # fmt: skip
@@ -280,42 +281,33 @@ def _all_places(side: int) -> Indices:
     return found
 
 
-def _around(x: Array, y: Array, weights: Array, side: int) -> Array:
-    """Weights of the cells of windows, (M, side^2): each ray's share to the four around it, as it is looked up."""
-    x, y = np.clip(x, 0, side - 1), np.clip(y, 0, side - 1)
-    j, i = (np.minimum(at.astype(np.int32), side - 2) for at in (x, y))
-    u, v = x - j, y - i
-    cell, first = i * np.int32(side) + j, _firsts(weights, side)
-    shares = [(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v]
-    cells = np.concatenate([(_order(side)[cell + offset] + first).ravel() for offset in (0, 1, side, side + 1)])
-    return _counted(cells, np.concatenate([(share * weights).ravel() for share in shares]), side, weights.shape[1])
+def _spread(x: Array, y: Array, weights: Array, steps: Sequence[Array], side: int, fine: bool) -> Array:
+    """Weights of the cells of windows, (M, side^2): of `POINTS` of each ray's parallelogram, or fewer, along a side.
 
-
-def _inside(x: Array, y: Array, weights: Array, steps: Sequence[Array], side: int) -> Array:
-    """Weights of the cells of windows, (M, side^2): a ray stands for a parallelogram, four points of it for that.
-
-    Each point's share goes to the texel that it is in.
+    In the finest level a point's share goes to the four cells around it, as it is looked up, in others to its own.
     """
-    first, last = _firsts(weights, side), np.float32(side - 0.5)
-    cells: Indices = np.empty((4, *weights.shape), dtype=np.intp)
-    for number, (a, b) in enumerate(((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))):
-        j, i = (
-            np.clip(at + np.float32(a) * across + np.float32(b) * along + np.float32(0.5), 0, last).astype(np.int32)
-            for at, across, along in zip((x, y), steps[:2], steps[2:], strict=True)
-        )
-        i *= np.int32(side)
-        i += j
-        np.add(_order(side)[i], first, out=cells[number])
-    share = np.broadcast_to(np.float32(0.25) * weights, cells.shape)
-    return _counted(cells.ravel(), share.ravel(), side, weights.shape[1])
-
-
-def _firsts(weights: Array, side: int) -> Any:
-    return np.arange(weights.shape[1], dtype=np.int32) * np.int32(side * side)
-
-
-def _counted(cells: Indices, shares: Array, side: int, count: int) -> Array:
-    total = np.bincount(cells, shares, count * side * side)
+    half, most, last = np.float32(0.5), np.float32(POINTS), np.float32(side - 1 if fine else side - 0.5)
+    right_u, right_v, below_u, below_v = steps
+    across, along = (
+        np.clip(np.ceil(np.maximum(np.abs(u), np.abs(v))), np.float32(1), most)
+        for u, v in ((right_u, right_v), (below_u, below_v))
+    )
+    part = weights / (across * along)
+    x, y = (x, y) if fine else (x + half, y + half)
+    first = np.arange(weights.shape[1], dtype=np.int32) * np.int32(side * side)
+    cells, shares = list[Any](), list[Array]()
+    for n, m in product(range(int(along.max(initial=0))), range(int(across.max(initial=0)))):
+        b, a = (np.float32(n) + half) / along - half, (np.float32(m) + half) / across - half
+        u, v = np.clip(x + a * right_u + b * below_u, 0, last), np.clip(y + a * right_v + b * below_v, 0, last)
+        j, i = (np.minimum(at.astype(np.int32), side - 2 if fine else side - 1) for at in (u, v))
+        share = np.where((m < across) & (n < along), part, np.float32(0)).astype(np.float64)
+        s, t = u.astype(np.float64) - j, v.astype(np.float64) - i
+        parts = ((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t) if fine else (1.0,)
+        cells += [_order(side)[i * side + j + offset] + first for offset in (0, 1, side, side + 1)[: len(parts)]]
+        shares += [each * share for each in parts]
+    # sums in double precision: ray by ray
+    number, count = np.stack(cells, 1).ravel(), weights.shape[1]
+    total = np.bincount(number, np.stack(shares, 1).ravel(), count * side * side)
     found: Image = total.astype(np.float32).reshape(count, side * side)
     return found
 

@@ -46,7 +46,10 @@ AnyDrops = Drop | Drops | Iterable[Drop | Drops]
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Drops that must be traced together, and where the image shows them."""
+    """Drops that must be traced together, and where the image shows them, but for those that are seen through others.
+
+    outlines: of all, or of some.
+    """
 
     drops: tuple[Drop, ...]
     outlines: Outlines
@@ -74,11 +77,11 @@ class Renderer:
     in some four times as long, and off by 4. Drops under gravity are drawn as caps of their volume where the bound of
     what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).
     lasting: whether a plan serves hundreds of frames: planned in twice the time (fifty times, without numba), of a
-    fifth of the texels (`pursuit`), and with finer rays at outlines, so that drops are within the tolerance of 1024
-    rays a pixel, of which 64 are off by nearly as much. None: with numba, tolerances from 0.9 to 2.5, and drops through
-    which more than 0.3 of the frame's pixels look, but not in sequences; a plan's renderer tells. 16-bit and floating
-    point frames may then show values a little beyond the image's. With numba any plan of drops at rest is made by up
-    to four threads, if OpenCV may use as many (`cv2.setNumThreads`); their number changes no bit.
+    fifth of the texels (`pursuit`), with errors from 0.5 to 1 of the tolerance, not to 0.6. None: with numba, for
+    tolerances from 0.9 to 2.5, and drops through which more than 0.27 of the frame's pixels look; a sequence is told
+    by its first frame, one with a motion does without. A plan's renderer tells. 16-bit and floating point frames may
+    then show values a little beyond the image's. With numba any plan of drops at rest is made by up to four threads,
+    if OpenCV may use as many (`cv2.setNumThreads`); their number changes no bit.
     """
 
     camera: Camera
@@ -119,6 +122,13 @@ class Renderer:
         renderer = self.told(self.lasting is None and self._minifier.is_crowded(batches))
         return Plan(renderer, everyone, tuple(renderer._minifier.lookups(batches)), tuple(layers))
 
+    def decided(self, sharp: Sequence[Drop]) -> Renderer:
+        """The same, told by its sharp drops whether plans last, unless it was or drops move."""
+        if self.moving or self.lasting is not None:
+            return self
+        groups = self.groups(sharp)
+        return self.told(self._minifier.is_crowded(self._batches(groups, np.arange(len(groups)))))
+
     def told(self, lasting: bool) -> Renderer:
         """The same, told whether plans last, unless it was or drops move."""
         return self if self.moving or self.lasting is not None else self._told[lasting]
@@ -132,10 +142,11 @@ class Renderer:
         return self._cap_tiers.of(drop) if self.moving else OWN
 
     def sequence(self, motion: Motion | None = None) -> sequence.Sequence:
-        """Plans of frame after frame, in which what does not change is traced once. motion: for `Sequence.at`."""
+        """Plans of frame after frame, in which what does not change is traced once. motion: for `Sequence.at`; with it
+        plans are not taken to last."""
         from . import sequence  # which needs this module
 
-        return sequence.Sequence(self.told(False), motion)
+        return sequence.Sequence(self if motion is None else self.told(False), motion)
 
     def split(
         self, drops: Sequence[Drop], known: Mapping[Key, BlurredLayer] | None = None
@@ -160,9 +171,20 @@ class Renderer:
         return sharp, layers
 
     def groups(self, drops: Sequence[Drop]) -> list[Group]:
-        """Drops that must be traced together, of those that the image shows."""
+        """Drops that must be traced together, of those that the image shows.
+
+        A drop bends rays so far to the sides that they may meet any drop on a later face: all that there is behind
+        others is one group.
+        """
         outlines = Outlines.of(drops, self.camera, self.chamber)
-        return [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in outlines.groups()]
+        faces = np.array([2 * drop.panel + (drop.face == "far") for drop in drops])
+        alone, through = list[Indices](), list[Indices]()
+        for rows in outlines.groups():
+            (alone if faces[rows].min() == faces.max() else through).append(rows)
+        groups = [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in alone]
+        if through:
+            groups.append(Group(tuple(drops), outlines.take(np.concatenate(through))))
+        return groups
 
     def lookups(self, groups: Sequence[Group], numbers: Iterable[int]) -> list[Any]:
         """What pixels look at in groups of drops, which get these numbers."""
@@ -328,10 +350,11 @@ def _batch(groups: Sequence[Group], numbers: Indices) -> Batch:
     if len(drops) == len(groups) and isinstance(drops[0], SphericalCap):
         pixels, which = outlines.pixels()
         return Batch(drops, pixels, numbers[which], which)
-    of_drop = np.repeat(numbers, [len(group.drops) for group in groups])
-    pixels, group = outlines.united(of_drop)  # circles of different groups share none
-    low, high = outlines.y - outlines.radius, outlines.y + outlines.radius
-    return Batch(drops, pixels, group, None, low, high)
+    of_circle = np.repeat(numbers, [len(group.outlines.x) for group in groups])
+    pixels, group = outlines.united(of_circle)  # circles of different groups share none
+    if len({(drop.panel, drop.face) for drop in drops}) > 1:  # what is seen through another may be anywhere
+        return Batch(drops, pixels, group)
+    return Batch(drops, pixels, group, None, outlines.y - outlines.radius, outlines.y + outlines.radius)
 
 
 def shapes(drops: AnyDrops) -> list[Drop]:

@@ -39,6 +39,7 @@ class _Generation:
 class Sequence:
     """Plans of frame after frame. Each is, bit for bit, what `Renderer.plan` gives for its drops.
 
+    A renderer that was not told whether plans last is, by the first frame's drops: that of all plans then.
     What is kept are the tables of groups of drops that are equal to a group of the frame before: caps of equal numbers,
     or the very same shapes. Of blurred layers all samples that no changed drop has to do with are kept (`retraced`).
     """
@@ -68,6 +69,7 @@ class Sequence:
             self._last = None
         sharp, layers = self.renderer.split(everyone, self._layers)
         self._layers = {tuple(layer.drops): layer for layer in layers}
+        self.renderer = self.renderer.decided(sharp)
         self._last = Plan(self.renderer, everyone, tuple(self._tables(sharp)), tuple(layers))
         return self._last
 

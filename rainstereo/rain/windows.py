@@ -1,8 +1,8 @@
-"""Taps in a third of the memory: a pixel's texels lie near one another, so each is held by its place in a small window.
+"""Taps in half of the memory: a pixel's texels lie near one another, so each is held by its place in a small window.
 
-A window is `SIDE` x `SIDE` texels of the finest level that a pixel looks at, and what covers it of the `LEVELS` - 1
-coarser ones. A texel's place in it takes 10 bits, most weights 6: two bytes in place of six. Pixels that look at places
-far apart, between drops, take four.
+A window is so many texels of the finest level that a pixel looks at, and what covers it of the `LEVELS` - 1 coarser
+ones. In a `NARROW` one a texel's place takes 10 bits, most weights 6: two bytes in place of six; in a `WIDE` one 12
+each, three bytes. Pixels that look at places far apart, between drops, take four.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from rainstereo import compiled
-from rainstereo.compiled.layout import PLACE
 from rainstereo.types import Mask
 
 from .pyramid import sizes
@@ -22,45 +21,70 @@ from .pyramid import starts as starts_of
 
 LEVELS = 4
 ALIGNED = 1 << (LEVELS - 1)  # windows begin at multiples of this, so that those of coarser levels begin with a texel
-SIDE = 3 * ALIGNED  # as wide as those of `quadtree` at tolerances from 0.75 on
-OTHER = (1 << (16 - PLACE)) - 1  # in place of weights that are not below it, or not above 0
 ROWS = 1 << 12  # that are packed at a time
 MOST_BITS = 31  # of a texel's number
+
+
+@dataclass(frozen=True)
+class Window:
+    """side: texels along it. place: bits of a texel's place. more: bits of a weight apart from that."""
+
+    side: int
+    place: int
+    more: int = 0
+
+    @property
+    def low(self) -> int:
+        """Bits of a weight in one number of 16 bits with the place."""
+        return 16 - self.place
+
+    @property
+    def other(self) -> int:
+        """In place of weights that are not below it, or not above 0."""
+        return (1 << self.low + self.more) - 1
+
+
+NARROW, WIDE = Window(3 * ALIGNED, 10), Window(5 * ALIGNED, 12, 8)  # the wider as those of `quadtree`, up to 2.5
 
 
 @dataclass(frozen=True, eq=False)
 class WindowTaps:
     """Taps of rows, in `pyramid.starts`' numbers of texels.
 
-    size: (width, height) of the image. corners: (M,) int32, the first texel of each row's window. counts: (M,) int32 of
-    taps. codes: (T,) uint16, places in windows, and above them weights, or `OTHER`. others, large: (O,) int32, int16,
-    numbers of taps with another weight, and what it is.
+    size: (width, height) of the image. window: of all rows. corners: (M,) int32, the first texel of each row's window.
+    counts: (M,) int32 of taps. codes: (T,) uint16, places in windows, and above them the low bits of weights, or of
+    `Window.other`. high: (T,) uint8, the others, if there are. others, large: (O,) int32, int16, numbers of taps with
+    another weight, and what it is.
     """
 
     size: tuple[int, int]
+    window: Window
     corners: Any
     counts: Any
     codes: Any
+    high: Any
     others: Any
     large: Any
 
     @classmethod
-    def of(cls, size: tuple[int, int], counts: Any, texels: Any, weights: Any) -> tuple[WindowTaps, Mask]:
+    def of(
+        cls, size: tuple[int, int], counts: Any, texels: Any, weights: Any, window: Window = NARROW
+    ) -> tuple[WindowTaps, Mask]:
         """The taps of those rows that can be held so, and which these are, (M,)."""
         ends = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-        parts, held = [cls._of_some(size, counts[:0], texels[:0], weights[:0], 0)], 0
+        parts, held = [cls._of_some(size, window, counts[:0], texels[:0], weights[:0], 0)], 0
         for first in range(0, len(counts), ROWS):
             rows = slice(first, first + ROWS)
             taps = slice(int(ends[first]), int(ends[min(first + ROWS, len(counts))]))
-            parts.append(cls._of_some(size, counts[rows], texels[taps], weights[taps], held))
+            parts.append(cls._of_some(size, window, counts[rows], texels[taps], weights[taps], held))
             held += len(parts[-1][0].codes)
-        names = ("corners", "counts", "codes", "others", "large")
+        names = ("corners", "counts", "codes", "high", "others", "large")
         found = [np.concatenate([getattr(part, name) for part, _ in parts]) for name in names]
-        return cls(size, *found), np.concatenate([fits for _, fits in parts])
+        return cls(size, window, *found), np.concatenate([fits for _, fits in parts])
 
     @classmethod
     def _of_some(
-        cls, size: tuple[int, int], counts: Any, texels: Any, weights: Any, before: int
+        cls, size: tuple[int, int], window: Window, counts: Any, texels: Any, weights: Any, before: int
     ) -> tuple[WindowTaps, Mask]:
         first, wide = _levels(size)
         level = np.searchsorted(first[1:-1], texels, "right").astype(np.int32)
@@ -71,17 +95,19 @@ class WindowTaps:
         along, down = (at - (np.repeat(corner, counts) >> above) for at, corner in ((column, left), (row, top)))
         good = (texels < first[-1]) & (above < LEVELS)
         for at in (along, down):
-            good &= at < SIDE >> np.minimum(above, LEVELS)
+            good &= at < window.side >> np.minimum(above, LEVELS)
         fits = _least(good, counts, True).astype(np.bool_)
         taps = np.repeat(fits, counts)
         above, along, down, weight = (values[taps] for values in (above, along, down, weights))
-        place = _firsts()[above] + down * (SIDE >> above) + along
-        plain = (weight > 0) & (weight < OTHER)
-        codes = (np.where(plain, weight, OTHER).astype(np.uint16) << np.uint16(PLACE)) | place.astype(np.uint16)
+        place = _firsts(window)[above] + down * (window.side >> above) + along
+        plain = (weight > 0) & (weight < window.other)
+        held = np.where(plain, weight, window.other).astype(np.uint16)
+        codes = (held << np.uint16(window.place)) | place.astype(np.uint16)
+        high = (held >> np.uint16(window.low)).astype(np.uint8)[: len(held) * bool(window.more)]
         corners = first[finest] + top * wide[finest] + left
         others = np.flatnonzero(~plain)
         found = cls(
-            size, corners[fits].astype(np.int32), counts[fits], codes, (others + before).astype(np.int32),
+            size, window, corners[fits].astype(np.int32), counts[fits], codes, high, (others + before).astype(np.int32),
             weight[others].astype(np.int16),
         )  # fmt: skip
         return found, fits
@@ -96,7 +122,7 @@ class WindowTaps:
         counts[0] -= skipped
         counts[-1] -= int(counts.sum()) - len(found)
         starts, wide = _levels(self.size)
-        above_of, offsets = _offsets(self.size)
+        above_of, offsets = _offsets(self.size, self.window)
         if compiled.available():
             from rainstereo.compiled.windows import places
 
@@ -107,14 +133,16 @@ class WindowTaps:
         above = np.arange(LEVELS)
         there = np.minimum(level[:, None] + above, len(wide) - 1)
         corners = starts[there] + (row[:, None] >> above) * wide[there] + (column[:, None] >> above)
-        place = codes & np.uint16((1 << PLACE) - 1)
+        place = codes & np.uint16((1 << self.window.place) - 1)
         which = np.repeat(np.arange(len(counts)), counts)
         found[:] = offsets[level[which], place] + corners[which, above_of[place]]
         return found
 
     def weights(self, first: int, last: int) -> Any:
         """Of taps from the first to before the last, int16."""
-        found = (self.codes[first:last] >> np.uint16(PLACE)).astype(np.int16)
+        found = (self.codes[first:last] >> np.uint16(self.window.place)).astype(np.int16)
+        if self.window.more:
+            found |= self.high[first:last].astype(np.int16) << np.int16(self.window.low)
         a, b = np.searchsorted(self.others, [first, last]).tolist()
         found[self.others[a:b] - first] = self.large[a:b]
         return found
@@ -125,7 +153,7 @@ class WindowTaps:
     @property
     def nbytes(self) -> int:
         """Of memory."""
-        return int(sum(each.nbytes for each in (self.corners, self.codes, self.others, self.large)))
+        return int(sum(each.nbytes for each in (self.corners, self.codes, self.high, self.others, self.large)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,18 +238,18 @@ def _levels(size: tuple[int, int]) -> tuple[Any, Any]:
 
 
 @cache
-def _firsts() -> Any:
+def _firsts(window: Window) -> Any:
     """The first place of a window's texels of each level, and of all, int32."""
-    return np.cumsum([0, *((SIDE >> above) ** 2 for above in range(LEVELS))]).astype(np.int32)
+    return np.cumsum([0, *((window.side >> above) ** 2 for above in range(LEVELS))]).astype(np.int32)
 
 
 @cache
-def _offsets(size: tuple[int, int]) -> tuple[Any, Any]:
-    """How many levels above the finest each place is, (2^PLACE,), and how far, in texels, it is from the window's
-    corner there, (levels, 2^PLACE) int32, if that is the finest level."""
-    wide = _levels(size)[1]
-    place = np.minimum(np.arange(1 << PLACE), _firsts()[-1] - 1)
-    above = np.searchsorted(_firsts()[1:-1], place, "right")
-    down, along = np.divmod(place - _firsts()[above], SIDE >> above)
+def _offsets(size: tuple[int, int], window: Window) -> tuple[Any, Any]:
+    """How many levels above the finest each place is, (2^place,), and how far, in texels, it is from the window's
+    corner there, (levels, 2^place) int32, if that is the finest level."""
+    wide, first = _levels(size)[1], _firsts(window)
+    place = np.minimum(np.arange(1 << window.place), first[-1] - 1)
+    above = np.searchsorted(first[1:-1], place, "right")
+    down, along = np.divmod(place - first[above], window.side >> above)
     level = np.minimum(np.arange(len(wide))[:, None] + above, len(wide) - 1)
     return above.astype(np.uint8), (down * wide[level] + along).astype(np.int32)

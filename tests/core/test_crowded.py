@@ -5,7 +5,10 @@ import pytest
 
 from rainstereo import Camera, Chamber, Panel, compiled
 from rainstereo.droplet import SphericalCap
+from rainstereo.rain.drops import Drops
 from rainstereo.rain.minified import CROWDED
+from rainstereo.rain.motion import Motion
+from rainstereo.rain.pane import Pane
 from rainstereo.rain.paste import FEW, PAIRED, READY
 from rainstereo.rain.render import Plan, Renderer
 from rainstereo.trace import Fate, trace
@@ -38,14 +41,31 @@ def plan(radius: float, **way: object) -> Plan:
 
 
 @needs_numba
-@pytest.mark.parametrize("radius", [1.9e-3, 2.2e-3, 3.0e-3, 3.4e-3])
+@pytest.mark.parametrize("radius", [1.9e-3, 2.8e-3, 3.2e-3, 3.4e-3])
 def test_drops_that_many_pixels_look_through(radius):
     """As those that last from a share of the frame on, which one ray a pixel tells as well; by the tree below it."""
     share = lit(radius)
     assert abs(share - CROWDED) > 0.02
     assert same(plan(radius), plan(radius, lasting=True)) == (share > CROWDED)
-    tree = Renderer(CAMERA, PANE).sequence().plan(drops(radius))
-    assert same(plan(radius), tree) == (share < CROWDED)
+    assert same(plan(radius), plan(radius, lasting=False)) == (share < CROWDED)
+
+
+@needs_numba
+def test_a_sequence_is_told_by_its_first_frame():
+    """What comes after is planned in the same way, crowded or not; with a motion, as drops that move."""
+    few, many = drops(1.9e-3), drops(3.4e-3)
+    image = np.random.default_rng(0).integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
+    for first, other in ((few, many), (many, few)):
+        sequence = Renderer(CAMERA, PANE).sequence()
+        told = sequence.plan(first).renderer
+        assert told.lasting is (first is many)
+        for each, expected in ((other, told), (first, Renderer(CAMERA, PANE))):
+            frames = [planned.apply(image) for planned in (sequence.plan(each), expected.plan(each))]
+            np.testing.assert_array_equal(*frames)
+    pane = Pane.seen(CAMERA, PANE)
+    columns = np.array([(*drop.centre, drop.radius, drop.contact_angle) for drop in many]).T
+    moving = Renderer(CAMERA, PANE).sequence(Motion(Drops(*columns), pane)).at(0.0)
+    assert moving.renderer.lasting is False
 
 
 @needs_numba
@@ -53,7 +73,7 @@ def test_drops_that_many_pixels_look_through(radius):
 def test_a_drop_list_makes_the_same_plan(lasting):
     """Also where the renderer was not told, or drops were a sequence's, and so were planned in another way."""
     renderer, image = Renderer(CAMERA, PANE, lasting=lasting), np.zeros((*SIZE[::-1], 3), np.uint8)
-    for planned in (renderer.plan(drops(3.4e-3)), renderer.sequence().plan(drops(3.4e-3))):
+    for planned in (renderer.plan(drops(3.4e-3)), renderer.told(False).sequence().plan(drops(3.4e-3))):
         again, listed = Renderer.from_json(planned.render(image).drops_json())
         assert again.lasting is planned.renderer.lasting is not None
         assert same(again.plan(listed), planned)
@@ -62,13 +82,12 @@ def test_a_drop_list_makes_the_same_plan(lasting):
 @needs_numba
 @pytest.mark.parametrize("tolerance", [0.8, 2.5, 10, np.inf])
 def test_other_tolerances_are_left_to_the_tree(tolerance):
-    tree = Renderer(CAMERA, PANE, tolerance=tolerance).sequence().plan(drops(3.4e-3))
-    assert same(plan(3.4e-3, tolerance=tolerance), tree)
+    assert same(plan(3.4e-3, tolerance=tolerance), plan(3.4e-3, tolerance=tolerance, lasting=False))
 
 
 def test_without_loops_it_is_the_tree(monkeypatch):
     monkeypatch.setattr(compiled, "available", lambda: False)
-    assert same(plan(2.5e-3), Renderer(CAMERA, PANE).sequence().plan(drops(2.5e-3)))
+    assert same(plan(2.5e-3), plan(2.5e-3, lasting=False))
 
 
 @needs_numba

@@ -53,6 +53,20 @@ def test_small_pixels_are_their_rays():
     assert not taps.error.any()
 
 
+def test_rays_stand_for_what_is_between_them():
+    """Pixels that 8 x 8 rays see every fourth pixel of, against 64 x 64 rays: much nearer than the rays themselves."""
+    rng, image = np.random.default_rng(4), photograph(SIZE)
+    centre, right, down = rng.uniform([40, 40], [160, 110], (200, 2)), np.zeros((200, 2)), np.zeros((200, 2))
+    right[:, 0], down[:, 1] = rng.uniform(20, 31, (2, 200))
+    x, y = spread(centre, right, down)
+    along = (np.arange(64) + 0.5) / 64 - 0.5
+    a, b = (n.reshape(-1, 1, 1) for n in np.meshgrid(along, along))
+    exact = looked_up(image, *np.moveaxis(np.float32(centre + a * right + b * down), -1, 0))
+    taps = Quadtree(SIZE, 33, 1e-5).taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
+    off = float(np.sqrt(np.mean((summed(taps, texels(image)) - exact) ** 2)))
+    assert off < 0.3 * float(np.sqrt(np.mean((looked_up(image, x, y) - exact) ** 2)))
+
+
 def test_worth_trades_texels_for_error():
     x, y = pixels(2, 300, 40)
     share, image = np.full(x.shape, 1 / SIDE**2, dtype=np.float32), photograph(SIZE)
@@ -158,7 +172,14 @@ def test_rays_are_placed_compiled_as_not(border, side, count, monkeypatch):
 @pytest.mark.parametrize("border", ["mirror", "edge"])
 @pytest.mark.parametrize(
     ("side", "count", "extent", "worth", "apart"),
-    [(8, 300, 17, 0.003, 0.4), (8, 300, 17, 0.3, 8), (4, 90, 9, 0.05, 2), (2, 70, 5, 1.0, 30), (16, 20, 33, 0.01, 1)],
+    [
+        (8, 300, 17, 0.003, 0.4),
+        (8, 90, 33, 0.002, 2.5),
+        (8, 300, 17, 0.3, 8),
+        (4, 90, 9, 0.05, 2),
+        (2, 70, 5, 1.0, 30),
+        (16, 20, 33, 0.01, 1),
+    ],
 )
 def test_cells_are_merged_compiled_as_not(border, side, count, extent, worth, apart, monkeypatch):
     """To the last bit: within texels and over dozens of them."""

@@ -114,6 +114,26 @@ def test_within_a_gray_level_of_many_rays_a_pixel(name, side):
     np.testing.assert_array_equal(found.image[found.opacity == 0], image[found.opacity == 0])
 
 
+def test_drops_that_are_seen_through_others():
+    """A steep drop shows drops of the panel behind it that stand elsewhere in the image; what it shows of them changes
+    with them, and does not depend on which pixels are traced together."""
+    before, behind = cap(-6, 0, 1.5, 60, panel=0), [cap(-0.5, 1, 3.0, 40, panel=1), cap(-6, -6, 1.2, 45, panel=1)]
+    image, renderer = photograph(), Renderer(CAMERA, TWO, DEPTH)
+    groups = renderer.groups([before, *behind])
+    assert sorted(len(group.drops) for group in groups) == [1, 1, 3]
+    found = renderer.plan([before, *behind]).render(image)
+    own = renderer.plan(before).render(image).opacity == 1
+    expected, _ = brute_force(image, [before, *behind], CAMERA, TWO, DEPTH, 16)
+    alone, _ = brute_force(image, [before], CAMERA, TWO, DEPTH, 16)
+    assert rms((expected - alone)[own]) > 4
+    assert rms((found.image - expected)[own]) < 1
+    batch = next(batch for batch in renderer._batches(groups, np.arange(len(groups))) if len(batch.drops) == 3)
+    rows = np.arange(0, len(batch.pixels), 37)
+    whole, some = (renderer._minifier.traced(batch, 16, which) for which in (slice(None), rows))
+    np.testing.assert_array_equal(whole.opacity[:, rows], some.opacity)
+    assert np.abs(whole.gain[:, rows] - some.gain).max() < 1e-3
+
+
 @pytest.mark.parametrize("lasting", [False, True])
 @pytest.mark.parametrize("gap", [0.3, 0.6, 1.0])
 def test_gaps_between_dark_rims(gap, lasting):

@@ -14,7 +14,7 @@ from rainstereo.rain.drops import Drops
 from rainstereo.rain.outlines import Outlines
 from rainstereo.rain.pyramid import sizes, starts
 from rainstereo.rain.render import Renderer
-from rainstereo.rain.windows import Column, PairTaps, WindowTaps
+from rainstereo.rain.windows import NARROW, WIDE, Column, PairTaps, WindowTaps
 
 SIZE = (203, 151)
 PANE = Chamber((0, 0, 1), 0.057, (Panel(0.003, 1.49),))
@@ -48,15 +48,19 @@ def taps(rng: np.random.Generator, size: tuple[int, int], rows: int) -> tuple[np
 
 
 @pytest.mark.usefixtures("way")
+@pytest.mark.parametrize("window", [NARROW, WIDE])
 @pytest.mark.parametrize("size", [SIZE, (1280, 960), (64, 48), (5, 4)])
-def test_taps_come_back_as_they_were(size, monkeypatch):
+def test_taps_come_back_as_they_were(size, window, monkeypatch):
     monkeypatch.setattr("rainstereo.rain.windows.ROWS", 50)
     rng = np.random.default_rng(1)
     counts, texels, weights = taps(rng, size, 330)
-    found, fits = WindowTaps.of(size, counts, texels, weights)
+    found, fits = WindowTaps.of(size, counts, texels, weights, window)
     some = np.repeat(fits, counts)
     assert fits.mean() > 0.3
-    assert fits.all() == (max(size) < 24)
+    narrow = WindowTaps.of(size, counts, texels, weights)[1]
+    assert narrow.all() == (max(size) < 24)
+    assert (fits >= narrow).all()
+    assert (len(found.high) > 0) == (window is WIDE)
     for row, (good, end) in enumerate(zip(fits, np.cumsum(counts), strict=True)):  # what is refused has a reason
         own = slice(end - counts[row], end)
         level = np.searchsorted(starts(size), texels[own], "right") - 1
@@ -125,6 +129,8 @@ def test_frames_are_the_same(depth, monkeypatch):
     columns = [each for table in held for each in vars(table.texels.taps).values() if isinstance(each, np.ndarray)]
     assert 0 < sum(column.nbytes for column in columns) < 3 * sum(len(table.texels) for table in narrow.tables)
     assert {type(table.texels.taps) for table in narrow.tables} == {WindowTaps, PairTaps}
+    windows = {each.window for table in narrow.tables if isinstance(each := table.texels.taps, WindowTaps)}
+    assert windows == {NARROW, WIDE}
     expected = wide.apply(image)
     monkeypatch.setattr(paste, "SMALL", 0)
     for held in (paste.HELD, 0):  # with room for cells, or without
