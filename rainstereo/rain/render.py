@@ -76,7 +76,8 @@ class Renderer:
     lasting: whether a plan serves hundreds of frames: planned in twice the time (fifty times, without numba), of a
     fifth of the texels (`pursuit`), and with finer rays at outlines, so that drops are within the tolerance of 1024
     rays a pixel, of which 64 are off by nearly as much. None: with numba, tolerances from 0.9 to 2.5, and drops through
-    which more than 0.3 of the frame's pixels look, but not in sequences; a plan's renderer tells. 16-bit and floating
+    which more than 0.3 of the frame's pixels look, but not in sequences; a plan's renderer tells. Where drops are so
+    many and small that texels would be more than some ten a pixel of the frame, there are fewer. 16-bit and floating
     point frames may then show values a little beyond the image's. With numba any plan of drops at rest is made by up
     to four threads, if OpenCV may use as many (`cv2.setNumThreads`); their number changes no bit.
     """
