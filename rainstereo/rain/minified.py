@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 
@@ -31,6 +31,7 @@ from .far_caps import MOST, FarCaps, are_far_caps
 from .free_memory import give_back
 from .lookups import JOINED, Lookups
 from .ordered_threads import in_order
+from .pursuit import MOST as MOST_TEXELS
 from .pursuit import Pursuit, forget
 from .quadtree import Quadtree
 from .samples import Samples
@@ -58,6 +59,10 @@ of 1024."""
 FINER_WORTH, EACH = 0.008, 0.2
 """The same in plans that last, and of a texel more in `Pursuit`: within the tolerance of 1024 rays a pixel."""
 DEAREST = 4.0
+AFFORDED = 10.6
+"""Texels for each pixel of the frame that plans which last may have: drawing them takes as long as interpolating it."""
+SAMPLED, FALLS = 2048, 3.6
+"""Pixels by which that is told before; as this power of how many times fewer they must be, texels get dearer."""
 STRICT = 0.9
 """Gray levels: for tolerances below, there is only the tree, whose windows are finer."""
 
@@ -110,7 +115,7 @@ class Minifier:
 
     depth: of the scene, metres. tolerance: gray levels RMS. source_size, shift: of the image that holds the scene,
     (width, height), and the place of the camera's image in it. border: "mirror" or "edge".
-    lasting: whether it is worth much time to find few texels.
+    lasting: whether it is worth much time to find few texels. dearer: times that these must be worth more than usual.
     """
 
     camera: Camera
@@ -121,12 +126,15 @@ class Minifier:
     shift: tuple[int, int] = (0, 0)
     border: str = "mirror"
     lasting: bool = False
+    dearer: float = 1.0
 
     def __post_init__(self) -> None:
         self.clear = _clear_map(self.camera, self.chamber)
 
     def lookups(self, batches: Sequence[Batch]) -> list[Lookups]:
         """What every pixel of the batches that a drop covers looks at."""
+        if self.dearer == 1 and (dearer := self._dearer(batches)) > 1:
+            return replace(self, dearer=dearer).lookups(batches)
         tables: list[Lookups] = []
         small: list[Lookups] = []
         wide: list[Lookups] = []
@@ -163,6 +171,20 @@ class Minifier:
         for part in (part for batch in batches for part in batch.parts()):
             room -= np.count_nonzero(self._kinds(part) == LIT)
         return room < 0
+
+    def _dearer(self, batches: Sequence[Batch]) -> float:
+        """How many times as much texels must be worth, so that there are not more of them than are `AFFORDED`."""
+        count, room = sum(len(batch.pixels) for batch in batches), AFFORDED * self.camera.width * self.camera.height
+        if not isinstance(self._sums, Pursuit) or count * MOST_TEXELS <= room:
+            return 1.0
+        step, first, taps, seen = max(count // SAMPLED, 1), 0, 0, 0
+        for batch in batches:
+            rows = np.arange(-first % step, len(batch.pixels), step)
+            first += len(batch.pixels)
+            if rows.size:
+                taps += len(self._of_rows(batch, rows, rays_along(self.tolerance)).texels)
+                seen += len(rows)
+        return float(max(taps / seen * count / room, 1.0) ** FALLS)
 
     def _narrow(self, tables: list[Lookups], wide: list[Lookups]) -> None:
         """Hold tables in less memory. wide: what takes more, and is waiting until it is many."""
@@ -304,11 +326,11 @@ class Minifier:
     def _sums(self) -> Pursuit | Quadtree:
         extent = next(extent for tolerance, extent in EXTENTS if self.tolerance <= tolerance)
         pursued = self.lasting and STRICT <= self.tolerance < math.inf
-        worth = FINER_WORTH if pursued else WORTH
-        tree = Quadtree(self.source_size, extent, min(worth * self.tolerance**2, DEAREST), self.border)
-        if not pursued:
-            return tree
-        return Pursuit(self.source_size, min(EACH * self.tolerance**2, DEAREST), tree)
+        price = self.dearer * self.tolerance**2
+        tree = Quadtree(
+            self.source_size, extent, min((FINER_WORTH if pursued else WORTH) * price, DEAREST), self.border
+        )
+        return Pursuit(self.source_size, min(EACH * price, DEAREST), tree) if pursued else tree
 
 
 def _labelled(drops: Sequence[Drop], which: Indices, pixels: Array) -> tuple[Sequence[Drop], Indices, Array]:

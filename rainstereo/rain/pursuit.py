@@ -30,6 +30,7 @@ from rainstereo.types import Array, Image, Indices, Mask
 
 from .best_weights import NEGATIVE, RIDGE, RIDGE_GROWS, gentle_weights
 from .exchange import GAIN, ROUNDS, exchanged
+from .parts import halved, leaps
 from .pyramid import LONG, Copy, copies, copy_starts, sizes
 from .quadtree import Quadtree, Steps, Taps, ends_of, mixed, of_some, span_of, whole
 
@@ -42,7 +43,7 @@ BINS = 4  # places along one of them to which rays are rounded
 ROOM = SIDE - ALIGNED + 1  # texels that rays may span, wherever they are
 POINTS = 4  # along a texel's side that stand for its area
 MOST = 40  # texels of a pixel
-SMALL = 9.0
+SMALL = 6.0
 """Pixels that rays must span: up to there their own four texels each are few enough, and exact."""
 SHRUNK = 4
 """Times that the photographs are shrunk whose statistics are taken: sharp images have more of what is fine."""
@@ -90,17 +91,14 @@ class Pursuit:
         return np.where((span < SMALL) | (level >= len(sizes(self.size))), -1, level)
 
     def taps(self, x: Array, y: Array, weights: Array) -> Taps:
-        """Texels of M pixels for rays that meet the image's plane at x, y, of weights, (K, M) float32, K a square.
-
-        Pixels that see several places far apart get those of the tree.
-        """
+        """Texels of M pixels for rays that meet the image's plane at x, y, of weights, (K, M) float32, K a square."""
         given = x, y
-        x, y, steps, span, loose = self.tree.placed(x, y, weights)
-        able = np.flatnonzero((self.level(span) >= 0) & ~loose)
+        x, y, steps, span, _ = self.tree.placed(x, y, weights)
+        able = np.flatnonzero(self.level(span) >= 0)
         rest = np.ones(len(span), dtype=np.bool_)
         rest[able] = False
         tree = self.tree.taps(given[0][:, rest], given[1][:, rest], weights[:, rest])
-        owner, share = self._parts(x[:, able], y[:, able], weights[:, able], span[able])
+        owner, share = self._parts(x[:, able], y[:, able], weights[:, able], of_some(steps, able), span[able])
         columns = able[owner]
         chosen = self._choose(x[:, columns], y[:, columns], share, of_some(steps, columns))
         there = np.arange(MOST) < chosen.counts[:, None]
@@ -108,22 +106,22 @@ class Pursuit:
         taps = whole(pixel, chosen.texel[there], chosen.weight[there], len(able), np.zeros(len(able)))
         return mixed(~rest, tree, taps)
 
-    def _parts(self, x: Array, y: Array, weights: Array, span: Array) -> tuple[Indices, Array]:
+    def _parts(self, x: Array, y: Array, weights: Array, steps: Steps, span: Array) -> tuple[Indices, Array]:
         """Parts of pixels that are told by windows of their own: whose each is, (P,) in order, and its weights, (K, P).
 
-        Pixels of whose rays most meet in a small place, and the rest do not, as beside a dark rim, are two parts.
+        Rays on both sides of a wide gap, as in two drops, are two parts; and so are those of which most meet in a small
+        place, and the rest, as beside a dark rim.
         """
-        level = self.level(span)
+        leap, first = leaps(x, y, weights, steps)
+        owner, share = halved(weights, leap & (self.level(span) > 0), first)
+        x, y = x[:, owner], y[:, owner]
+        level = self.level(span_of(x, y, share))
         wide = np.flatnonzero(level >= FINER)
-        inside = self._dense(x[:, wide], y[:, wide], weights[:, wide], level[wide] - FINER)
-        two = inside.any(0) & (~inside & (weights[:, wide] > 0)).any(0)
-        wide, inside = wide[two], inside[:, two]
-        first, second = weights.copy(), weights[:, wide].copy()
-        first[:, wide] *= inside
-        second *= ~inside
-        owner = np.concatenate([np.arange(len(span)), wide])
-        order = np.argsort(owner, kind="stable")
-        return owner[order], np.concatenate([first, second], 1)[:, order]
+        inside = self._dense(x[:, wide], y[:, wide], share[:, wide], level[wide] - FINER)
+        two, first = np.zeros(len(owner), dtype=np.bool_), np.zeros(share.shape, dtype=np.bool_)
+        two[wide], first[:, wide] = inside.any(0), inside
+        half, share = halved(share, two, first)
+        return owner[half], share
 
     def _dense(self, x: Array, y: Array, weights: Array, level: Indices) -> Mask:
         """Which rays are in a window of a level, (M,), around the pixel's middle ray, (K, M), if `MOST_RAYS` are."""

@@ -5,6 +5,7 @@ import pytest
 
 from rainstereo import Camera, Chamber, Panel, compiled
 from rainstereo.droplet import SphericalCap
+from rainstereo.rain import minified
 from rainstereo.rain.drops import Drops
 from rainstereo.rain.minified import CROWDED
 from rainstereo.rain.motion import Motion
@@ -12,6 +13,7 @@ from rainstereo.rain.pane import Pane
 from rainstereo.rain.paste import FEW, PAIRED, READY
 from rainstereo.rain.render import Plan, Renderer
 from rainstereo.trace import Fate, trace
+from tests.core.texel_sums import photograph
 
 SIZE = (160, 120)
 CAMERA = Camera.pinhole(400, 400, 79.5, 59.5, *SIZE)
@@ -88,6 +90,35 @@ def test_other_tolerances_are_left_to_the_tree(tolerance):
 def test_without_loops_it_is_the_tree(monkeypatch):
     monkeypatch.setattr(compiled, "available", lambda: False)
     assert same(plan(2.5e-3), plan(2.5e-3, lasting=False))
+
+
+def small_drops(count: int) -> Drops:
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(-0.012, 0.012, count), rng.uniform(-0.009, 0.009, count)
+    return Drops(x, y, rng.uniform(5e-5, 4e-4, count), rng.uniform(0.3, 1.2, count))
+
+
+@needs_numba
+@pytest.mark.parametrize("afforded", [4.0, 7.0])
+def test_texels_of_very_many_drops_are_as_many_as_a_frame_affords(afforded, monkeypatch):
+    """What is left out costs error, but less than it would be with other texels than the best."""
+    pixels = SIZE[0] * SIZE[1]
+    monkeypatch.setattr(minified, "AFFORDED", 40.0)
+    free = Renderer(CAMERA, PANE).plan(small_drops(3000))
+    assert free._paste_all.taps > 8 * pixels
+    monkeypatch.setattr(minified, "AFFORDED", afforded)
+    held = Renderer(CAMERA, PANE).plan(small_drops(3000))
+    assert 0.85 * afforded * pixels < held._paste_all.taps < 1.15 * afforded * pixels
+    image = photograph(SIZE).astype(np.uint8)
+    off = free.apply(image).astype(float) - held.apply(image)
+    assert np.sqrt(np.mean(off * off)) < (4 if afforded < 5 else 1.5)
+
+
+@needs_numba
+def test_texels_of_few_drops_are_not_dearer(monkeypatch):
+    planned = plan(2.2e-3)
+    monkeypatch.setattr(minified, "AFFORDED", np.inf)
+    assert same(planned, plan(2.2e-3))
 
 
 @needs_numba

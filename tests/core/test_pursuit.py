@@ -1,5 +1,7 @@
 """Few texels for a pixel's rays: against the rays, the tree, and the best weights found from points."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 from rainstereo import Camera, Chamber, Panel
 from rainstereo.droplet import SphericalCap
 from rainstereo.patch import folded
+from rainstereo.rain.parts import LEAP, halved, leaps
 from rainstereo.rain.pursuit import BINS, MOST, POINTS, SHRUNK, Pursuit, _dictionary, _scene
 from rainstereo.rain.pursuit import SIDE as SIDE_OF_WINDOW
 from rainstereo.rain.pyramid import copies, copy_starts, half, sizes, starts
@@ -103,15 +106,79 @@ def test_a_dense_place_and_what_is_far_from_it():
     x, y = rays(SIDE)
     truth = cv2.remap(image, *rays(4 * SIDE), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101).mean(0)
     own = pursuit(0.01)
-    owner, share = own._parts(x, y, even(x), span_of(x, y, even(x)))
+    owner, share = own._parts(x, y, even(x), steps_between(x, y, even(x)), span_of(x, y, even(x)))
     assert len(owner) > 1.8 * count
     total = np.zeros((len(x), count))
     np.add.at(total.T, owner, share.T)
     np.testing.assert_allclose(total, even(x))
     apart = summed(own.taps(x, y, even(x)), texels(image))
-    object.__setattr__(own, "_parts", lambda x, _y, weights, _span: (np.arange(x.shape[1]), weights))
+    object.__setattr__(own, "_parts", lambda x, _y, weights, *_: (np.arange(x.shape[1]), weights))
     together = summed(own.taps(x, y, even(x)), texels(image))
     assert rms(apart - truth) < 0.9 * rms(together - truth)
+
+
+def two_places(seed: int, count: int, apart: float, side: int = SIDE) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of pixels at the seam of two drops, which cuts each anywhere: those beyond it look so far away."""
+    x, y = pixels(seed, count, 25, side)
+    rng = np.random.default_rng(seed)
+    turn, cut, beyond = rng.uniform(0, 2 * np.pi, (2, count)), rng.uniform(-0.3, 0.3, count), 0.5 * apart
+    along = (np.arange(side) + 0.5) / side - 0.5
+    a, b = (n.reshape(-1, 1) for n in np.meshgrid(along, along))
+    sign = np.where(a * np.cos(turn[0]) + b * np.sin(turn[0]) > cut, beyond, -beyond)
+    return (x + sign * np.cos(turn[1])).astype(np.float32), (y + sign * np.sin(turn[1])).astype(np.float32)
+
+
+def test_pixels_at_the_seam_of_two_drops():
+    """Each side has a window of its own: a third of the tree's texels, for less error, against the same rays."""
+    image = photograph(SIZE)
+    x, y = two_places(11, 300, 150)
+    at = (folded(np.stack([x, y], -1), SIZE)[..., axis] for axis in (0, 1))
+    truth = cv2.remap(image, *map(np.ascontiguousarray, at), cv2.INTER_LINEAR).mean(0)
+    own = pursuit(0.3)
+    ours, tree = own.taps(x, y, even(x)), own.tree.taps(x, y, even(x))
+    assert len(ours.texels) < 0.45 * len(tree.texels)
+    assert rms(summed(ours, texels(image)) - truth) < rms(summed(tree, texels(image)) - truth)
+
+
+@given(st.integers(0, 10**6), st.floats(0, 200), st.floats(0, 1))
+def test_leaps_between_rays(seed, apart, dark):
+    """Against gaps found one pixel and one ray after the other."""
+    x, y = two_places(seed, 6, apart, 4)
+    weights = even(x) * (np.random.default_rng(seed).random(x.shape) >= dark)
+    steps = steps_between(x, y, weights)
+    found, before = leaps(x, y, weights, steps)
+    for pixel in range(x.shape[1]):
+        lit = np.flatnonzero(weights[:, pixel])
+        widest, axis, low = 0.0, 1, 0.0
+        for which, at in ((1, y), (0, x)):
+            there = sorted(at[lit, pixel].tolist())
+            for one, other in pairwise(there):
+                if other - one > widest:
+                    widest, axis, low = other - one, which, one
+        if widest == 0:
+            assert not found[pixel]
+            continue
+        strides = [max(abs(float(steps[axis][ray, pixel])), abs(float(steps[axis + 2][ray, pixel]))) for ray in lit]
+        if abs(widest - LEAP * np.mean(strides)) > 1e-3:
+            assert found[pixel] == (widest > LEAP * np.mean(strides))
+        if widest > 1e-3:
+            np.testing.assert_array_equal(before[lit, pixel], (x, y)[axis][lit, pixel] <= low)
+
+
+@given(st.integers(0, 10**6), st.integers(0, 20))
+def test_halves_of_pixels(seed, count):
+    """Each ray is in one of a pixel's parts, which are at most two, and none is dark if the pixel is not."""
+    rng = np.random.default_rng(seed)
+    weights = (rng.random((16, count)) * (rng.random((16, count)) < rng.random(count))).astype(np.float32)
+    two, first = rng.random(count) < 0.5, rng.random((16, count)) < rng.random(count)
+    owner, share = halved(weights, two, first)
+    assert (np.diff(owner) >= 0).all()
+    for pixel in range(count):
+        parts = share[:, owner == pixel]
+        np.testing.assert_array_equal(parts.sum(1), weights[:, pixel])
+        assert ((parts > 0).sum(1) <= 1).all()
+        lit = [weights[some, pixel].any() for some in (first[:, pixel], ~first[:, pixel])]
+        assert parts.shape[1] == (2 if two[pixel] and all(lit) else 1)
 
 
 def test_weights_are_the_best_ones():
