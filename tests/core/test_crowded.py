@@ -99,7 +99,7 @@ def small_drops(count: int) -> Drops:
 
 
 @needs_numba
-@pytest.mark.parametrize("afforded", [4.0, 7.0])
+@pytest.mark.parametrize("afforded", [4.0, 8.0])
 def test_texels_of_very_many_drops_are_as_many_as_a_frame_affords(afforded, monkeypatch):
     """What is left out costs error, but less than it would be with other texels than the best."""
     pixels = SIZE[0] * SIZE[1]
