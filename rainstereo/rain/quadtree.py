@@ -16,7 +16,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -287,27 +286,34 @@ def _spread(x: Array, y: Array, weights: Array, steps: Sequence[Array], side: in
     In the finest level a point's share goes to the four cells around it, as it is looked up, in others to its own.
     """
     half, most, last = np.float32(0.5), np.float32(POINTS), np.float32(side - 1 if fine else side - 0.5)
-    right_u, right_v, below_u, below_v = steps
+    ray = np.flatnonzero(weights)
+    x, y, share, right_u, right_v, below_u, below_v = (each.ravel()[ray] for each in (x, y, weights, *steps))
     across, along = (
         np.clip(np.ceil(np.maximum(np.abs(u), np.abs(v))), np.float32(1), most)
         for u, v in ((right_u, right_v), (below_u, below_v))
     )
-    part = weights / (across * along)
-    x, y = (x, y) if fine else (x + half, y + half)
-    first = np.arange(weights.shape[1], dtype=np.int32) * np.int32(side * side)
-    cells, shares = list[Any](), list[Array]()
-    for n, m in product(range(int(along.max(initial=0))), range(int(across.max(initial=0)))):
-        b, a = (np.float32(n) + half) / along - half, (np.float32(m) + half) / across - half
-        u, v = np.clip(x + a * right_u + b * below_u, 0, last), np.clip(y + a * right_v + b * below_v, 0, last)
-        j, i = (np.minimum(at.astype(np.int32), side - 2 if fine else side - 1) for at in (u, v))
-        share = np.where((m < across) & (n < along), part, np.float32(0)).astype(np.float64)
+    number = (across * along).astype(np.intp)
+    of = np.repeat(np.arange(len(ray)), number)
+    n, m = np.divmod(
+        (np.arange(len(of)) - np.repeat(np.cumsum(number) - number, number)).astype(np.float32), across[of]
+    )
+    a, b = (m + half) / across[of] - half, (n + half) / along[of] - half
+    if not fine:
+        x, y = x + half, y + half
+    u = np.clip(x[of] + a * right_u[of] + b * below_u[of], 0, last)
+    v = np.clip(y[of] + a * right_v[of] + b * below_v[of], 0, last)
+    j, i = (np.minimum(at.astype(np.int32), side - 2 if fine else side - 1) for at in (u, v))
+    part = (share / (across * along)).astype(np.float64)[of]
+    cell, count = i * np.int32(side) + j, weights.shape[1]
+    first = (ray % count).astype(np.int32)[of] * np.int32(side * side)
+    if not fine:
+        total = np.bincount(_order(side)[cell] + first, part, count * side * side)
+    else:
         s, t = u.astype(np.float64) - j, v.astype(np.float64) - i
-        parts = ((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t) if fine else (1.0,)
-        cells += [_order(side)[i * side + j + offset] + first for offset in (0, 1, side, side + 1)[: len(parts)]]
-        shares += [each * share for each in parts]
-    # sums in double precision: ray by ray
-    number, count = np.stack(cells, 1).ravel(), weights.shape[1]
-    total = np.bincount(number, np.stack(shares, 1).ravel(), count * side * side)
+        cells = [_order(side)[cell + offset] + first for offset in (0, 1, side, side + 1)]
+        parts = [each * part for each in ((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t)]
+        # point by point, as the loop has it
+        total = np.bincount(np.stack(cells, 1).ravel(), np.stack(parts, 1).ravel(), count * side * side)
     found: Image = total.astype(np.float32).reshape(count, side * side)
     return found
 
