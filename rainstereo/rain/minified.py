@@ -56,7 +56,7 @@ WORTH = 0.0015
 large drops (the tests') are within 0.65 gray levels of 576 rays a pixel, and within the tolerance of 64, which are
 wrong by 0.6 to 0.8 there. In rain on photographs (the benchmark's) 64 are wrong by 0.7 to 1.5, and drops within 0.6
 of 1024."""
-FINER_WORTH, EACH = 0.008, 0.25
+FINER_WORTH, EACH = 0.008, 0.2
 """The same in plans that last, and of a texel more in `Pursuit`: within the tolerance of 1024 rays a pixel."""
 DEAREST = 4.0
 AFFORDED = 10.6
