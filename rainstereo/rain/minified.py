@@ -37,7 +37,7 @@ from .quadtree import Quadtree
 from .samples import Samples
 
 RAYS = 2  # along a pixel's side, to begin with
-CHUNK = 4096  # pixels traced at a time with all their rays
+CHUNK = 2048  # pixels traced at a time with all their rays
 TOGETHER = 1 << 16  # pixels that are held at a time
 OUTLINE = 2
 """Times as many rays along a side at the outline of a drop, for plans that last."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rainstereo.camera import Camera
+from rainstereo.caps import Caps, joined, some_of
 from rainstereo.chamber import Chamber
 from rainstereo.compiled import available
 from rainstereo.droplet import Drop, SphericalCap
@@ -48,7 +49,7 @@ AnyDrops = Drop | Drops | Iterable[Drop | Drops]
 class Group:
     """Drops that must be traced together, and where the image shows them."""
 
-    drops: tuple[Drop, ...]
+    drops: Sequence[Drop]
     outlines: Outlines
 
     @property
@@ -108,7 +109,10 @@ class Renderer:
         """Trace drops: one, a table of them, or any mixture of both, in no particular order."""
         if isinstance(drops, Drops) and (alone := self._of_table(drops)) is not None:
             return Plan(self, drops.lazily(), alone, ())
-        everyone = tuple(shapes(drops))
+        if isinstance(drops, Drops) and self._is_sharp and not self.moving:
+            everyone: Sequence[Drop] = drops.lazily()
+        else:
+            everyone = tuple(shapes(drops))
         sharp, layers = self.split(everyone)
         tables = self._of_caps_alone(self._cap_tiers.drawn(sharp)) if self.moving else None
         if tables is not None:
@@ -117,8 +121,14 @@ class Renderer:
         if self.moving:
             return Plan(self, everyone, tuple(self.lookups(groups, range(len(groups)))), tuple(layers))
         batches = self._batches(groups, np.arange(len(groups)))
+        del groups  # whose circles take as much as the drops
         renderer = self.told(self.lasting is None and self._minifier.is_crowded(batches))
         return Plan(renderer, everyone, tuple(renderer._minifier.lookups(batches)), tuple(layers))
+
+    @property
+    def _is_sharp(self) -> bool:
+        """Whether all drops are, wherever they are."""
+        return self.lens is None or math.isinf(self.lens.f_number)
 
     def told(self, lasting: bool) -> Renderer:
         """The same, told whether plans last, unless it was or drops move."""
@@ -145,7 +155,7 @@ class Renderer:
 
         Layers in `known` are taken as they are; of others, what is in those is not traced again.
         """
-        if self.lens is None or math.isinf(self.lens.f_number):
+        if self._is_sharp or self.lens is None:
             return drops, []
         place = (self.scene_size, self.shift, self.fold)
         sharp, blurred = by_disc(drops, self.camera, self.chamber, self.lens)
@@ -163,7 +173,7 @@ class Renderer:
     def groups(self, drops: Sequence[Drop]) -> list[Group]:
         """Drops that must be traced together, of those that the image shows."""
         outlines = Outlines.of(drops, self.camera, self.chamber)
-        return [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in outlines.groups()]
+        return [Group(some_of(drops, rows), outlines.take(rows)) for rows in outlines.groups()]
 
     def lookups(self, groups: Sequence[Group], numbers: Iterable[int]) -> list[Any]:
         """What pixels look at in groups of drops, which get these numbers."""
@@ -185,8 +195,7 @@ class Renderer:
 
     def _of_table(self, drops: Drops) -> tuple[CapTable, ...] | None:
         """The same of a table of sharp ones, without shapes; None also if there are none."""
-        sharp = self.lens is None or math.isinf(self.lens.f_number)
-        if not (self.moving and sharp and len(drops) and drops.face == "far" and drops.index >= 1):
+        if not (self.moving and self._is_sharp and len(drops) and drops.face == "far" and drops.index >= 1):
             return None
         room(self.chamber, drops.panel, drops.face)
         scene = self._cap_scene(drops.panel)
@@ -236,8 +245,9 @@ class Renderer:
         """Caps of a face in one batch if each is alone, in another if not; groups with other drops on their own."""
         alike: dict[Any, list[int]] = {}
         for i, group in enumerate(groups):
-            places = {(drop.panel, drop.face, drop.index) for drop in group.drops if isinstance(drop, SphericalCap)}
-            caps = len(places) == 1 and all(isinstance(drop, SphericalCap) for drop in group.drops)
+            some = group.drops[:1] if isinstance(group.drops, Caps) else group.drops  # all are alike
+            places = {(drop.panel, drop.face, drop.index) for drop in some if isinstance(drop, SphericalCap)}
+            caps = len(places) == 1 and all(isinstance(drop, SphericalCap) for drop in some)
             alike.setdefault((*places, len(group.drops) == 1) if caps else i, []).append(i)
         return [_batch([groups[i] for i in some], numbers[some]) for some in alike.values()]
 
@@ -324,7 +334,7 @@ def _by_far_face(groups: Sequence[Group]) -> dict[int | None, list[int]]:
 
 def _batch(groups: Sequence[Group], numbers: Indices) -> Batch:
     """Groups as one batch: one group, or caps of one face."""
-    drops = [drop for group in groups for drop in group.drops]
+    drops = joined([group.drops for group in groups])
     outlines = Outlines.joined([group.outlines for group in groups])
     if len(drops) == len(groups) and isinstance(drops[0], SphericalCap):
         pixels, which = outlines.pixels()
