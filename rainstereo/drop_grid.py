@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from .caps import numbers_of
 from .droplet import Drop
 from .types import Array, Indices
 
 NOBODY = -1
 """The number of no drop."""
+BLOCK = 1 << 15  # drops that are sorted at a time
 CELLS = 256  # along each side, at most
 ROUNDING = 1e-5  # of the reach: single precision must not lose a ray at the rim
 
@@ -22,15 +26,13 @@ class DropGrid:
     it belongs to the one it is closest to, in the same sense, of those that it can meet: that stand no farther away
     than it moves along the face over their height.
 
-    margin: greatest slope, against the normal, of the rays that will ask.
+    given: numbers of the drops. margin: greatest slope, against the normal, of the rays that will ask.
     """
 
-    def __init__(self, drops: dict[int, Drop], origin: Array, margin: float) -> None:
+    def __init__(self, given: Sequence[int], drops: Sequence[Drop], origin: Array, margin: float) -> None:
         self.margin = margin
-        numbers = np.array(list(drops))
-        centres = np.array([origin[:2] + np.asarray(drop.centre) for drop in drops.values()])
-        reach = np.array([drop.reach for drop in drops.values()])
-        top = np.array([drop.top for drop in drops.values()])
+        numbers, centres = np.array(given), origin[:2] + numbers_of(drops, "centre")
+        reach, top = (numbers_of(drops, name) for name in ("reach", "top"))
         first = np.lexsort((reach, *centres.T, -top))  # of equals, `whose` takes the first
         numbers, centres, reach, top = numbers[first], centres[first], reach[first], top[first]
         self.numbers = np.append(numbers, NOBODY)
@@ -48,14 +50,21 @@ class DropGrid:
         last = np.floor((centres + wide[:, None] - self.low) / self.cell).astype(np.intp).clip(0, self.size - 1)
         across, down = (last - first + 1).T
         count = across * down
-        row = np.repeat(np.arange(len(centres)), count)
-        step = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)  # number of the cell within the drop
-        cell = (first[row, 1] + step // across[row]) * self.size[0] + first[row, 0] + step % across[row]
-        order = np.argsort(cell, kind="stable")
-        cell, row = cell[order], row[order]
-        layer = np.arange(len(cell)) - np.searchsorted(cell, cell)
-        table = np.full((int(layer.max()) + 1, int(self.size.prod()) + 1), NOBODY)
-        table[layer, cell] = row
+        cells = int(self.size.prod())
+        so_far: Indices = np.zeros(cells, dtype=np.intp)
+        table: Indices = np.empty((0, cells + 1), dtype=np.int32)
+        for begun in range(0, len(centres), BLOCK):
+            some = slice(begun, begun + BLOCK)
+            row = begun + np.repeat(np.arange(len(count[some])), count[some])
+            step = np.arange(len(row)) - np.repeat(np.cumsum(count[some]) - count[some], count[some])  # within the drop
+            cell = (first[row, 1] + step // across[row]) * self.size[0] + first[row, 0] + step % across[row]
+            order = np.argsort(cell, kind="stable")
+            cell, row = cell[order], row[order]
+            layer = so_far[cell] + np.arange(len(cell)) - np.searchsorted(cell, cell)
+            so_far += np.bincount(cell, minlength=cells)
+            more = max(int(so_far.max()) - len(table), 0)
+            table = np.concatenate([table, np.full((more, cells + 1), NOBODY, dtype=np.int32)])
+            table[layer, cell] = row
         return table
 
     def whose(self, x: Array, y: Array, slope: Array) -> Indices:

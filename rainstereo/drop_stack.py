@@ -120,7 +120,9 @@ class Face:
         slope = np.sqrt(1 / np.clip(kz2, 1 / (1 + STEEPEST**2), 1) - 1)
         steepest = float(np.fmax.reduce(slope, initial=0.0))
         if self.grid is None or self.grid.margin < steepest:
-            self.grid = DropGrid(self.drops, self.origin, min(1.5 * steepest, STEEPEST))
+            self.grid = DropGrid(
+                list(self.drops), list(self.drops.values()), self.origin, min(1.5 * steepest, STEEPEST)
+            )
         return self.grid.whose(rays.x, rays.y, slope)
 
 

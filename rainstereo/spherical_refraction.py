@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from . import fresnel, types
+from .caps import Caps
 from .droplet import SphericalCap
 from .fresnel import Number
 from .ray_bundle import Fate, RayBundle
@@ -39,8 +40,11 @@ class CapColumns:
     @classmethod
     def of(cls, caps: Sequence[SphericalCap], origin: Array) -> CapColumns:
         """Columns with one entry a cap; `origin` is that of the face's coordinates in the panel frame."""
-        table = np.array([(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps], dtype=np.float64)
-        x, y, radius, angle, index = table.T
+        if isinstance(caps, Caps):
+            (x, y, radius, angle), index = caps.table(), np.full(len(caps), caps.place["index"], dtype=np.float64)
+        else:
+            table = [(*cap.centre, cap.radius, cap.contact_angle, cap.index) for cap in caps]
+            x, y, radius, angle, index = np.array(table, dtype=np.float64).T
         return cls(
             x=origin[0] + x,
             y=origin[1] + y,

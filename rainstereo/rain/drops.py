@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
+from rainstereo.caps import Caps
 from rainstereo.droplet import CENTRE_LIMIT, RADIUS_RANGE, WATER, Drop, SphericalCap
 from rainstereo.types import Array, Indices
 from rainstereo.young_laplace_drop import YoungLaplaceDrop, bond_number
@@ -130,9 +131,9 @@ class Drops:
             for x, y, radius, angle in table
         ]
 
-    def lazily(self) -> Sequence[Drop]:
-        """`shapes`, made when the first of them is asked for."""
-        return _Shapes(self)
+    def lazily(self) -> Caps:
+        """`shapes`, made when they are asked for."""
+        return Caps((self.x, self.y, self.radius, self.contact_angle), self.place)
 
     def cover(self, pane: Pane) -> float:
         """Share of the pane's rectangle that lies within contact circles, overlaps counted once.
@@ -150,36 +151,3 @@ class Drops:
             rows = slice(*np.searchsorted(down, (y - a, y + a)))
             wet[rows, columns] |= (down[rows, None] - y) ** 2 + (along[columns] - x) ** 2 < a * a
         return float(wet.mean())
-
-
-class _Shapes(Sequence[Drop]):
-    def __init__(self, table: Drops) -> None:
-        self._table = table
-
-    @cached_property
-    def _made(self) -> tuple[Drop, ...]:
-        return tuple(self._table.shapes())
-
-    def __len__(self) -> int:
-        return len(self._table)
-
-    @overload
-    def __getitem__(self, which: int) -> Drop: ...
-
-    @overload
-    def __getitem__(self, which: slice) -> Sequence[Drop]: ...
-
-    def __getitem__(self, which: int | slice) -> Drop | Sequence[Drop]:
-        return self._made[which]
-
-    def __iter__(self) -> Iterator[Drop]:
-        return iter(self._made)
-
-    def __eq__(self, other: object) -> bool:
-        return self._made == tuple(other) if isinstance(other, tuple | _Shapes) else NotImplemented
-
-    def __hash__(self) -> int:
-        return hash(self._made)
-
-    def __repr__(self) -> str:
-        return repr(self._made)

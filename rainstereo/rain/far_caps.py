@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from rainstereo import compiled
 from rainstereo.camera import Camera
+from rainstereo.caps import Caps, numbers_of, places_of
 from rainstereo.chamber import Chamber
 from rainstereo.drop_grid import DropGrid
 from rainstereo.drop_stack import STEEPEST, DropStack
@@ -30,9 +31,9 @@ STEEPER = 1.5  # than rays through the middles of pixels are those that a grid i
 
 def are_far_caps(drops: Sequence[Drop]) -> bool:
     """Whether drops are caps on one panel's far face."""
-    places = {(drop.panel, drop.face) if isinstance(drop, SphericalCap) else None for drop in drops}
-    place = places.pop() if len(places) == 1 else None
-    return place is not None and place[1] == "far"
+    caps = isinstance(drops, Caps) or all(isinstance(drop, SphericalCap) for drop in drops)
+    places = places_of(drops) if caps else set()
+    return len(places) == 1 and places.pop()[1] == "far"
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,17 +58,19 @@ class FarCaps:
         """None if the loop does not suit: there is none, or there are other drops."""
         if not (compiled.available() and are_far_caps(drops)):
             return None
-        stack = DropStack(chamber, drops)
-        stack.check_depth(depth)
+        stack = DropStack(chamber, [drops[int(numbers_of(drops, "top").argmax())]])  # the others have room, too
         if stack.frame is None or not np.isfinite(stack.end):
             return None
+        centres = numbers_of(drops, "centre")
+        away = stack.frame.to_camera(np.c_[centres, np.zeros(len(centres))])[:, 2]
+        DropStack(chamber, [drops[int(away.argmax())]]).check_depth(depth)
         own = next(i for i, face in enumerate(stack.faces) if face.drops)
         before = np.array([(face.z, face.n1, face.n2) for face in stack.faces[: own + 1]])
         later = np.array(
             [(b.z - a.z, b.n1, b.n2) for a, b in zip(stack.faces[own:], stack.faces[own + 1 :], strict=False)]
         )
         face = stack.faces[own]
-        columns = CapColumns.of([drop for drop in drops if isinstance(drop, SphericalCap)], face.origin)
+        columns = CapColumns.of(cast(Sequence[SphericalCap], drops), face.origin)
         caps = np.stack([getattr(columns, name) for name in columns.__dataclass_fields__], -1)
         faces = before, later.reshape(-1, 3)
         return cls(camera, depth, drops, stack.frame.R_panel_cam, faces, stack.end, face.origin, caps, [])
@@ -119,7 +122,7 @@ class FarCaps:
         steepest = min(float(np.sqrt(np.nanmax(square, initial=0))), STEEPEST)
         if not self.grids or self.grids[0].margin < steepest:
             margin = min(STEEPER * steepest, STEEPEST)
-            self.grids[:] = [DropGrid(dict(enumerate(self.drops)), self.origin, margin)]
+            self.grids[:] = [DropGrid(range(len(self.drops)), self.drops, self.origin, margin)]
         grid = self.grids[0]
         low, table = grid.low.astype(np.float32), np.ascontiguousarray(grid.table, dtype=np.float32)
         return low, np.float32(grid.cell), grid.size.astype(np.int64), table, grid.candidates, grid.numbers

@@ -38,7 +38,7 @@ from .samples import Samples
 from .windows import WIDE
 
 RAYS = 2  # along a pixel's side, to begin with
-CHUNK = 4096  # pixels traced at a time with all their rays
+CHUNK = 2048  # pixels traced at a time with all their rays
 TOGETHER = 1 << 16  # pixels that are held at a time
 OUTLINE = 2
 """Times as many rays along a side at the outline of a drop."""

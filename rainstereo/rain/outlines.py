@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rainstereo.camera import Camera
+from rainstereo.caps import numbers_of, places_of
 from rainstereo.chamber import Chamber
 from rainstereo.droplet import Drop
 from rainstereo.panel_plane import PanelFrame
@@ -69,8 +70,11 @@ class Outlines:
     @classmethod
     def _of_some(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber, aside: float = 0.0) -> Outlines:
         frame = PanelFrame.of(chamber)
-        reach, top = (np.array([getattr(drop, name) for drop in drops]) for name in ("reach", "top"))
-        top *= [1 if drop.face == "far" else -1 for drop in drops]
+        reach, top = (numbers_of(drops, name) for name in ("reach", "top"))
+        if len(places_of(drops)) == 1:
+            top *= 1 if next(iter(places_of(drops)))[1] == "far" else -1
+        else:
+            top *= [1 if drop.face == "far" else -1 for drop in drops]
         return cls._around(_bases(drops, frame, chamber), reach, top, frame, camera, chamber, aside)
 
     @classmethod
@@ -224,11 +228,11 @@ RING, BETWEEN = _ring(), _between()
 
 def _bases(drops: Sequence[Drop], frame: PanelFrame, chamber: Chamber) -> Array:
     """Points of the faces where drops sit, (N, 3), in the panel frame."""
-    places = {(drop.panel, drop.face) for drop in drops}
+    places = places_of(drops)
     origins = {place: frame.base(chamber, (0.0, 0.0), *place) for place in places}
     if len(places) == 1:
         bases = np.tile(origins.popitem()[1], (len(drops), 1))
     else:
         bases = np.array([origins[drop.panel, drop.face] for drop in drops])
-    bases[:, :2] += np.array([drop.centre for drop in drops])
+    bases[:, :2] += numbers_of(drops, "centre")
     return bases

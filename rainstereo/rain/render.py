@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rainstereo.camera import Camera
+from rainstereo.caps import Caps, joined, places_of, some_of
 from rainstereo.chamber import Chamber
 from rainstereo.compiled import available
 from rainstereo.droplet import Drop, SphericalCap
@@ -51,7 +52,7 @@ class Group:
     outlines: of all, or of some.
     """
 
-    drops: tuple[Drop, ...]
+    drops: Sequence[Drop]
     outlines: Outlines
 
     @property
@@ -111,7 +112,10 @@ class Renderer:
         """Trace drops: one, a table of them, or any mixture of both, in no particular order."""
         if isinstance(drops, Drops) and (alone := self._of_table(drops)) is not None:
             return Plan(self, drops.lazily(), alone, ())
-        everyone = tuple(shapes(drops))
+        if isinstance(drops, Drops) and self._is_sharp and not self.moving:
+            everyone: Sequence[Drop] = drops.lazily()
+        else:
+            everyone = tuple(shapes(drops))
         sharp, layers = self.split(everyone)
         tables = self._of_caps_alone(self._cap_tiers.drawn(sharp)) if self.moving else None
         if tables is not None:
@@ -120,6 +124,7 @@ class Renderer:
         if self.moving:
             return Plan(self, everyone, tuple(self.lookups(groups, range(len(groups)))), tuple(layers))
         batches = self._batches(groups, np.arange(len(groups)))
+        del groups  # whose circles take as much as the drops
         renderer = self.told(self.lasting is None and self._minifier.is_crowded(batches))
         return Plan(renderer, everyone, tuple(renderer._minifier.lookups(batches)), tuple(layers))
 
@@ -129,6 +134,11 @@ class Renderer:
             return self
         groups = self.groups(sharp)
         return self.told(self._minifier.is_crowded(self._batches(groups, np.arange(len(groups)))))
+
+    @property
+    def _is_sharp(self) -> bool:
+        """Whether all drops are, wherever they are."""
+        return self.lens is None or math.isinf(self.lens.f_number)
 
     def told(self, lasting: bool) -> Renderer:
         """The same, told whether plans last, unless it was or drops move."""
@@ -156,7 +166,7 @@ class Renderer:
 
         Layers in `known` are taken as they are; of others, what is in those is not traced again.
         """
-        if self.lens is None or math.isinf(self.lens.f_number):
+        if self._is_sharp or self.lens is None:
             return drops, []
         place = (self.scene_size, self.shift, self.fold)
         sharp, blurred = by_disc(drops, self.camera, self.chamber, self.lens)
@@ -178,11 +188,12 @@ class Renderer:
         others is one group.
         """
         outlines = Outlines.of(drops, self.camera, self.chamber)
-        faces = np.array([2 * drop.panel + (drop.face == "far") for drop in drops])
-        alone, through = list[Indices](), list[Indices]()
-        for rows in outlines.groups():
-            (alone if faces[rows].min() == faces.max() else through).append(rows)
-        groups = [Group(tuple(drops[i] for i in rows), outlines.take(rows)) for rows in alone]
+        alone, through = outlines.groups(), list[Indices]()
+        if len(places_of(drops)) > 1:
+            faces = np.array([2 * drop.panel + (drop.face == "far") for drop in drops])
+            through = [rows for rows in alone if faces[rows].min() < faces.max()]
+            alone = [rows for rows in alone if faces[rows].min() == faces.max()]
+        groups = [Group(some_of(drops, rows), outlines.take(rows)) for rows in alone]
         if through:
             groups.append(Group(tuple(drops), outlines.take(np.concatenate(through))))
         return groups
@@ -207,8 +218,7 @@ class Renderer:
 
     def _of_table(self, drops: Drops) -> tuple[CapTable, ...] | None:
         """The same of a table of sharp ones, without shapes; None also if there are none."""
-        sharp = self.lens is None or math.isinf(self.lens.f_number)
-        if not (self.moving and sharp and len(drops) and drops.face == "far" and drops.index >= 1):
+        if not (self.moving and self._is_sharp and len(drops) and drops.face == "far" and drops.index >= 1):
             return None
         room(self.chamber, drops.panel, drops.face)
         scene = self._cap_scene(drops.panel)
@@ -258,8 +268,9 @@ class Renderer:
         """Caps of a face in one batch if each is alone, in another if not; groups with other drops on their own."""
         alike: dict[Any, list[int]] = {}
         for i, group in enumerate(groups):
-            places = {(drop.panel, drop.face, drop.index) for drop in group.drops if isinstance(drop, SphericalCap)}
-            caps = len(places) == 1 and all(isinstance(drop, SphericalCap) for drop in group.drops)
+            some = group.drops[:1] if isinstance(group.drops, Caps) else group.drops  # all are alike
+            places = {(drop.panel, drop.face, drop.index) for drop in some if isinstance(drop, SphericalCap)}
+            caps = len(places) == 1 and all(isinstance(drop, SphericalCap) for drop in some)
             alike.setdefault((*places, len(group.drops) == 1) if caps else i, []).append(i)
         return [_batch([groups[i] for i in some], numbers[some]) for some in alike.values()]
 
@@ -346,14 +357,14 @@ def _by_far_face(groups: Sequence[Group]) -> dict[int | None, list[int]]:
 
 def _batch(groups: Sequence[Group], numbers: Indices) -> Batch:
     """Groups as one batch: one group, or caps of one face."""
-    drops = [drop for group in groups for drop in group.drops]
+    drops = joined([group.drops for group in groups])
     outlines = Outlines.joined([group.outlines for group in groups])
     if len(drops) == len(groups) and isinstance(drops[0], SphericalCap):
         pixels, which = outlines.pixels()
         return Batch(drops, pixels, numbers[which], which)
     of_circle = np.repeat(numbers, [len(group.outlines.x) for group in groups])
     pixels, group = outlines.united(of_circle)  # circles of different groups share none
-    if len({(drop.panel, drop.face) for drop in drops}) > 1:  # what is seen through another may be anywhere
+    if len(places_of(drops)) > 1:  # what is seen through another may be anywhere
         return Batch(drops, pixels, group)
     return Batch(drops, pixels, group, None, outlines.y - outlines.radius, outlines.y + outlines.radius)
 

@@ -356,7 +356,7 @@ def test_whose_a_ray_is(rng: np.random.Generator, margin: float) -> None:
             rng.uniform([-0.01, -0.01, 2e-4, 0.05], [0.01, 0.01, 3e-3, 1.5], (60, 4))
         )
     }
-    grid = DropGrid(drops, np.zeros(3), margin)
+    grid = DropGrid(list(drops), list(drops.values()), np.zeros(3), margin)
     x, y = rng.uniform(-0.015, 0.015, (2, 5000))
     slope = rng.uniform(0, margin, 5000)
     centres = np.array([drop.centre for drop in drops.values()])
