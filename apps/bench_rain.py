@@ -32,6 +32,7 @@ FRAMES = 20
 SIDE, SAMPLED, FEW = 32, 3000, 200
 """Rays along each side of a pixel in the reference of sharp drops, and pixels that are compared; few if `quick`."""
 OTHERS = ("astronaut", "coffee", "chelsea", "gravel", "rocket")
+MANY = 100_000  # small drops, on a frame of full size
 APERTURE_SAMPLES = 1024
 CROP = 96
 """Side, pixels, of the window in which blurred drops are compared with samples of the aperture."""
@@ -116,14 +117,18 @@ def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised
     frame = "cv2.remap of the frame"
     variants = [Variant(frame, partial(_of_each, images, _remap(image, seed)), _nothing, note="R")]
     targets = []
-    for share, limit in ((0.02, 0.2), (0.1, 0.6), (0.4, 1.2), (0.8, 1.2)):
-        drops = _rain(camera, pane, share, seed)
+    cases = [
+        (f"{100 * share:.0f} %", _rain(camera, pane, share, seed), limit, ways)
+        for share, limit, ways in (
+            (0.02, 0.2, 3), (0.1, 0.6, 3), (0.34, 1.2, 1), (0.4, 1.2, 3), (0.8, 1.2, 2), (0.95, 1.2, 1),
+        )
+    ]  # fmt: skip
+    many = MANY if promised else MANY // 16
+    for case, drops, limit, ways in (*cases, (f"{many:,} small drops", _small(camera, pane, many, seed), 1.2, 1)):
         truth: Truth | None = None
-        for renderer, name in ((lasting, ""), (default, ", by default"), (coarse, ", coarse")):
-            if share > 0.5 and renderer is coarse:
-                continue
+        for renderer, name in ((default, ", by default"), (lasting, ""), (coarse, ", coarse"))[:ways]:
             plan = renderer.plan(drops)
-            label = f"{100 * share:.0f} %{name}"
+            label = case + name
             truth = truth or Truth.of(plan, seed, SAMPLED if promised else FEW)
             variants.append(
                 Variant(
@@ -135,8 +140,8 @@ def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised
     return Work(
         "still",
         "Drops that stand still",
-        f"{len(images)} frames in a row, of as many photographs. Planned before, with `Renderer(lasting=True)`, by "
-        "default, and coarsely; the time is that of drawing the frames.",
+        f"{len(images)} frames in a row, of as many photographs. Planned before, by default, with "
+        "`Renderer(lasting=True)`, and coarsely; the time is that of drawing the frames.",
         tuple(variants),
         "10 %",
         "gray levels",
@@ -338,6 +343,13 @@ def _rain(camera: Camera, pane: Chamber, share: float, seed: int) -> Drops:
         hidden = float((renderer.plan(drops.take(slice(some))).opacity > 0).mean())
         few, many = (some + 1, many) if hidden < share else (few, some)
     return drops.take(slice(few))
+
+
+def _small(camera: Camera, pane: Chamber, count: int, seed: int) -> Drops:
+    """So many drops of 0.1 to 0.8 mm, anywhere on the pane: they cover all of it several times over."""
+    rng, seen = np.random.default_rng(seed), Pane.seen(camera, pane)
+    x, y = rng.uniform(seen.low, seen.high, (count, 2)).T
+    return Drops(x, y, rng.uniform(5e-5, 4e-4, count), rng.uniform(0.3, 1.2, count))
 
 
 def _remap(image: Image, seed: int) -> Callable[[Image], Image]:
