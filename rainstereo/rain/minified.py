@@ -59,7 +59,7 @@ of 1024."""
 FINER_WORTH, EACH = 0.008, 0.2
 """The same in plans that last, and of a texel more in `Pursuit`: within the tolerance of 1024 rays a pixel."""
 DEAREST = 4.0
-AFFORDED = 10.4
+AFFORDED = 10.0
 """Texels for each pixel of the frame that plans which last may have: drawing them takes as long as interpolating it."""
 SAMPLED, FALLS = 2048, 3.6
 """Pixels by which that is told before; as this power of how many times fewer they must be, texels get dearer."""

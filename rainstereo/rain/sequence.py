@@ -39,7 +39,8 @@ class _Generation:
 class Sequence:
     """Plans of frame after frame. Each is, bit for bit, what `Renderer.plan` gives for its drops.
 
-    A renderer that was not told whether plans last is, by the first frame's drops: that of all plans then.
+    A renderer that was not told whether plans last is, by the first frame's drops: that of all plans then. Drops that
+    come later have texels of the usual price, even if they are so many that a plan's would be dearer.
     What is kept are the tables of groups of drops that are equal to a group of the frame before: caps of equal numbers,
     or the very same shapes. Of blurred layers all samples that no changed drop has to do with are kept (`retraced`).
     """
