@@ -34,7 +34,7 @@ from .outlines import BETWEEN, MARGIN, RING
 STEP = 8  # pixels between nodes, as in `compiled.cap_rays`
 LENSES = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8", "LENSMODEL_OPENCV12")
 FAR = 1e7  # pixels: of an outline without end
-FINE = (25.0, 9), (math.inf, 16)
+FINE = (25.0, 9), (math.inf, 12)
 COARSE = (36.0, 4), (math.inf, 6)
 """Square root of the area, pixels, up to which what a pixel shows gets how many looks."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
