@@ -126,7 +126,7 @@ def _still_work(camera: Camera, pane: Chamber, image: Image, seed: int, promised
     many = MANY if promised else MANY // 16
     for case, drops, limit, ways in (*cases, (f"{many:,} small drops", _small(camera, pane, many, seed), 1.2, 1)):
         truth: Truth | None = None
-        for renderer, name in ((default, ", by default"), (lasting, ""), (coarse, ", coarse"))[:ways]:
+        for renderer, name in ((default, ""), (lasting, ", lasting"), (coarse, ", coarse"))[:ways]:
             plan = renderer.plan(drops)
             label = case + name
             truth = truth or Truth.of(plan, seed, SAMPLED if promised else FEW)
