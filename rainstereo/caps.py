@@ -32,11 +32,8 @@ class Caps(Sequence[SphericalCap]):
 
     def take(self, which: Indices | slice) -> Caps:
         """Some of them."""
-        return Caps(
-            self.columns,
-            self.place,
-            which if isinstance(self.rows, slice) and self.rows == slice(None) else self.numbers[which],
-        )
+        every = isinstance(self.rows, slice) and self.rows == slice(None)
+        return Caps(self.columns, self.place, which if every else self.numbers[which])
 
     def table(self) -> Array:
         """x, y, radius and contact angle, (4, N)."""
@@ -66,7 +63,8 @@ class Caps(Sequence[SphericalCap]):
     def __getitem__(self, which: int | slice) -> SphericalCap | Caps:
         if isinstance(which, slice):
             return self.take(which)
-        x, y, radius, angle = (float(column[self.rows][which]) for column in self.columns)
+        at = self.rows[which] if isinstance(self.rows, np.ndarray) else range(len(self.columns[0]))[self.rows][which]
+        x, y, radius, angle = (float(column[at]) for column in self.columns)
         return SphericalCap((x, y), radius, angle, **self.place)
 
     def __iter__(self) -> Iterator[SphericalCap]:

@@ -20,6 +20,7 @@ import numpy as np
 
 from rainstereo import compiled
 from rainstereo.camera import Camera
+from rainstereo.caps import some_of
 from rainstereo.chamber import Chamber
 from rainstereo.drop_grid import NOBODY
 from rainstereo.droplet import Drop
@@ -86,7 +87,7 @@ class Batch:
     def near(self, first: int, last: int) -> Sequence[Drop]:
         """The drops that rows of the image, from the first to the last, can show."""
         seen = np.broadcast_to((self.low <= last) & (self.high >= first), len(self.drops))
-        return [self.drops[i] for i in np.flatnonzero(seen).tolist()]
+        return some_of(self.drops, np.flatnonzero(seen))
 
     def far_caps(self, camera: Camera, chamber: Chamber, depth: float) -> FarCaps | None:
         """The drops, ready to be traced by a loop in machine code, if it suits them."""
