@@ -68,13 +68,13 @@ class Sequence:
         state = self._moving(renderer).at(frame / drive.fps)
         if self._last is None or not _same(self._last[0], state):
             trails = self._trails.of(state)
-            self._last = state, self._plans.plan([*trails, self.rain.in_sight(state.drops, drive.size)])
+            self._last = state, self._plans.plan([*trails, self.rain.in_sight(state.drops, drive.size)], state.rests)
         return self._last[1]
 
     @cached_property
     def _plans(self) -> Plans:
         """Makes plans, and traces what has not moved only once; wherever it begins, in the same way."""
-        return self.rain.renderer(self.drive.size).told(False).sequence()
+        return self.rain.renderer(self.drive.size).sequence()
 
     def _moving(self, renderer: Renderer) -> Motion:
         if self._motion is None:
@@ -116,7 +116,8 @@ class Sequence:
 def _same(one: PaneState, other: PaneState) -> bool:
     drops, others = one.drops, other.drops
     return (
-        len(drops) == len(others) == len(one.unchanged(other))
+        one.rests == other.rests
+        and len(drops) == len(others) == len(one.unchanged(other))
         and len(one.trails) == len(other.trails)
         and all(a.same(b) for a, b in zip(one.trails, other.trails, strict=True))
     )

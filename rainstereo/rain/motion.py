@@ -53,6 +53,7 @@ class PaneState:
 
     drops: by id. velocity: (N, 2) metres a second in the panel's plane, 0 for drops at rest. trails: the ridges behind
     drops, by the id of the drop that left them, uphill first. water: the balance at the last step of the simulation.
+    rests: whether the pane stays as it is from now on: no drop runs, dries or is still to come, no trail to part.
     """
 
     time: float
@@ -60,6 +61,7 @@ class PaneState:
     velocity: Array
     trails: tuple[TrailPath, ...]
     water: WaterBalance
+    rests: bool
 
     def shapes(self, gravity: tuple[float, float, float] | None = None, bond: float = 0.0) -> list[Drop]:
         """Drops (see `Drops.shapes`) and then the pieces of all trails, for the tracer."""
@@ -152,7 +154,10 @@ class Motion:
             x, y = (x, y) + velocity.T * (part / self._rate)
         columns = {name: rows[name] for name in ("radius", "contact_angle", "birth", "id")}
         drops = Drops(x=x, y=y, **columns, **self.drops.place)
-        return PaneState(time, drops, velocity, trail_paths(now.water.rows, self.downhill), self._balance(now))
+        trails = trail_paths(now.water.rows, self.downhill)
+        dries = self.evaporation is not None and self.evaporation.humidity < 1 and len(drops) > 0
+        rests = now.arrived == len(self._rules.coming) and not (running.size or trails or dries)
+        return PaneState(time, drops, velocity, trails, self._balance(now), rests)
 
     def _balance(self, now: Simulation) -> WaterBalance:
         arrived = self._initial + float(self._rules.coming.volume[: now.arrived].sum())

@@ -79,11 +79,12 @@ class Renderer:
     what that is wrong by keeps the tolerance (`cap_tier`, `Plan.tiers`).
     lasting: whether a plan serves hundreds of frames: planned in twice the time (fifty times, without numba), of a
     fifth of the texels (`pursuit`), with errors from 0.5 to 1 of the tolerance, not to 0.6. None: with numba, for
-    tolerances from 0.9 to 2.5, and drops through which more than 0.27 of the frame's pixels look; a sequence is told
-    by its first frame, one with a motion does without. A plan's renderer tells. Where drops are so many and small that
-    texels would be more than some ten a pixel of the frame, there are fewer. 16-bit and floating point frames may then
-    show values a little beyond the image's. With numba any plan of drops at rest is made by up to four threads, if
-    OpenCV may use as many (`cv2.setNumThreads`); their number changes no bit.
+    tolerances from 0.9 to 2.5, and drops through which more than 0.27 of the frame's pixels look; a sequence is
+    told by its first frame, one with a motion by that from which on nothing changes, and does without before. A
+    plan's renderer tells. Where drops are so many and small that texels would be more than some ten a pixel of the
+    frame, there are fewer. 16-bit and floating point frames may then show values a little beyond the image's. With
+    numba any plan of drops at rest is made by up to four threads, if OpenCV may use as many (`cv2.setNumThreads`);
+    their number changes no bit.
     """
 
     camera: Camera
@@ -153,11 +154,10 @@ class Renderer:
         return self._cap_tiers.of(drop) if self.moving else OWN
 
     def sequence(self, motion: Motion | None = None) -> sequence.Sequence:
-        """Plans of frame after frame, in which what does not change is traced once. motion: for `Sequence.at`; with it
-        plans are not taken to last."""
+        """Plans of frame after frame, in which what does not change is traced once. motion: for `Sequence.at`."""
         from . import sequence  # which needs this module
 
-        return sequence.Sequence(self if motion is None else self.told(False), motion)
+        return sequence.Sequence(self, motion)
 
     def split(
         self, drops: Sequence[Drop], known: Mapping[Key, BlurredLayer] | None = None

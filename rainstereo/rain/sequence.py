@@ -39,44 +39,56 @@ class _Generation:
 class Sequence:
     """Plans of frame after frame. Each is, bit for bit, what `Renderer.plan` gives for its drops.
 
-    A renderer that was not told whether plans last is, by the first frame's drops: that of all plans then. Drops that
-    come later have texels of the usual price, even if they are so many that a plan's would be dearer.
+    A renderer that was not told whether plans last is, by the drops of the first frame at rest: that of all such frames
+    then; those that something is about to change do not last. Drops that come later have texels of the usual price,
+    even if they are so many that a plan's would be dearer.
     What is kept are the tables of groups of drops that are equal to a group of the frame before: caps of equal numbers,
     or the very same shapes. Of blurred layers all samples that no changed drop has to do with are kept (`retraced`).
     """
 
     def __init__(self, renderer: Renderer, motion: Motion | None = None) -> None:
         self.renderer, self.motion = renderer, motion
+        self._restless, self._tracing = renderer.told(False), renderer
         self._numbers: dict[Key, int] = {}
         self._next = 0
         self._generations: list[_Generation] = []
         self._layers: dict[Key, BlurredLayer] = {}
         self._last: Plan | None = None
+        self._rested = True
         self._shapes = PaneShapes()
 
     def at(self, time: float) -> Plan:
         """The plan for a time of the motion, seconds."""
         if self.motion is None:
             raise ValueError("this sequence has no motion; make it with Renderer.sequence(motion), or use `plan`")
-        return self.plan(self._shapes.of(self.motion.at(time)))
+        state = self.motion.at(time)
+        return self.plan(self._shapes.of(state), state.rests)
 
-    def plan(self, drops: AnyDrops) -> Plan:
-        """The plan for the next frame's drops."""
+    def plan(self, drops: AnyDrops, rests: bool = True) -> Plan:
+        """The plan for the next frame's drops. rests: whether they stay from now on, for all that is known."""
         everyone = tuple(shapes(drops))
-        if self._last is not None and self._last.drops == everyone:
+        if self._last is not None and self._last.drops == everyone and self._rested == rests:
             return self._last
         if self._last is not None:
             self._last.let_go()  # before memory is needed for the next
             self._last = None
         sharp, layers = self.renderer.split(everyone, self._layers)
         self._layers = {tuple(layer.drops): layer for layer in layers}
-        self.renderer = self.renderer.decided(sharp)
-        self._last = Plan(self.renderer, everyone, tuple(self._tables(sharp)), tuple(layers))
+        if rests:
+            self.renderer = self.renderer.decided(sharp)
+        self._trace_by(self.renderer if rests else self._restless)
+        self._last, self._rested = Plan(self._tracing, everyone, tuple(self._tables(sharp)), tuple(layers)), rests
         return self._last
+
+    def _trace_by(self, renderer: Renderer) -> None:
+        """Tables of another renderer are of no use."""
+        if renderer.lasting != self._tracing.lasting:
+            self._numbers, self._generations = {}, []
+        self._tracing = renderer
 
     def _tables(self, sharp: Row[Drop]) -> list[Any]:
         """Tables of the groups of sharp drops; only new groups are traced."""
-        groups = self.renderer.groups(sharp)
+        groups = self._tracing.groups(sharp)
         keys = [group.key for group in groups]
         new = [group for group, key in zip(groups, keys, strict=True) if key not in self._numbers]
         fresh = range(self._next, self._next + len(new))
@@ -87,7 +99,7 @@ class Sequence:
         kept = [generation.only(known) for generation in self._generations]
         self._generations = kept = [generation for generation in kept if generation.groups]  # the others' memory goes
         if new:
-            kept = [*kept, _Generation(frozenset(fresh), self.renderer.lookups(new, fresh))]
+            kept = [*kept, _Generation(frozenset(fresh), self._tracing.lookups(new, fresh))]
         self._numbers, self._next = numbers, fresh.stop
         if len(kept) > MOST_GENERATIONS:  # the first is the largest, and stays
             late = kept[1:]

@@ -19,12 +19,13 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from rainstereo import imagefile
+from rainstereo import compiled, imagefile
 from rainstereo.apps.cli import main
 from rainstereo.apps.rain_motion import Drive, Sequence
 from rainstereo.apps.rain_presets import PRESETS
 from rainstereo.apps.rain_settings import Rain
 from rainstereo.height_map import HeightMap
+from rainstereo.rain.population import LogNormal
 from rainstereo.rain.render import Renderer
 from rainstereo.types import Image
 
@@ -372,6 +373,23 @@ def test_rain_that_goes_on_wets_the_pane_again() -> None:
         drive = Drive("a", SIZE, 31, "paper", 10, refill)  # after 3 s, all that were above 4 mm have run off
         counts[refill] = len(Sequence(Rain(PRESETS["large"]), drive).plan(30).drops)
     assert counts[0.5] > 2 * counts[math.inf] > 0
+
+
+@pytest.mark.skipif(not compiled.available(), reason="needs numba")
+def test_a_pane_that_rests_is_planned_to_last() -> None:
+    """Where nothing moves, dries or is to come, and drops are many."""
+
+    def rain(cover: float, largest: float) -> Rain:
+        law = replace(PRESETS["large"].population, diameter=LogNormal(3e-3, 0.2, 2e-3, largest), cover=cover)
+        return Rain(replace(PRESETS["large"], population=law, f_number=math.inf))
+
+    for case, motion, refill, lasting in (
+        (rain(0.9, 3.9e-3), "paper", math.inf, True), (rain(0.9, 3.9e-3), "paper", 5.0, False),
+        (rain(0.9, 8e-3), "paper", math.inf, False), (rain(0.9, 3.9e-3), "physical", math.inf, False),
+        (rain(0.1, 3.9e-3), "paper", math.inf, False),
+    ):  # fmt: skip
+        plan = Sequence(case, Drive("a", SIZE, 31, motion, 10, refill)).plan(9)
+        assert plan.renderer.lasting is lasting
 
 
 def video(path: Path, count: int = 3) -> list[Image]:

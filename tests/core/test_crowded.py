@@ -1,5 +1,7 @@
 """Plans of so many pixels that they are made as those that last, and what their taps take."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from rainstereo.rain.motion import Motion
 from rainstereo.rain.pane import Pane
 from rainstereo.rain.paste import FEW, PAIRED, READY
 from rainstereo.rain.render import Plan, Renderer
+from rainstereo.rain.slip import PaperSlip
 from rainstereo.trace import Fate, trace
 from tests.core.texel_sums import photograph
 
@@ -54,7 +57,7 @@ def test_drops_that_many_pixels_look_through(radius):
 
 @needs_numba
 def test_a_sequence_is_told_by_its_first_frame():
-    """What comes after is planned in the same way, crowded or not; with a motion, as drops that move."""
+    """What comes after is planned in the same way, crowded or not."""
     few, many = drops(1.9e-3), drops(3.4e-3)
     image = np.random.default_rng(0).integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
     for first, other in ((few, many), (many, few)):
@@ -64,10 +67,31 @@ def test_a_sequence_is_told_by_its_first_frame():
         for each, expected in ((other, told), (first, Renderer(CAMERA, PANE))):
             frames = [planned.apply(image) for planned in (sequence.plan(each), expected.plan(each))]
             np.testing.assert_array_equal(*frames)
-    pane = Pane.seen(CAMERA, PANE)
-    columns = np.array([(*drop.centre, drop.radius, drop.contact_angle) for drop in many]).T
-    moving = Renderer(CAMERA, PANE).sequence(Motion(Drops(*columns), pane)).at(0.0)
-    assert moving.renderer.lasting is False
+
+
+@needs_numba
+def test_a_motion_tells_from_when_it_rests():
+    """Frames before are planned as those of drops that move, and each is the same in any order."""
+    columns = np.array([(*drop.centre, drop.radius, drop.contact_angle) for drop in drops(3.4e-3)]).T
+    late = Drops(np.zeros(1), np.zeros(1), np.array([4e-4]), np.array([0.6]), birth=np.array([1.0]))
+    everyone = Drops.joined([Drops(*columns), late])
+    image = np.random.default_rng(0).integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
+
+    def frames(coming: Drops, times: tuple[float, ...], **way: object) -> list[Plan]:
+        motion = Motion(replace(coming, id=np.arange(len(coming))), Pane.seen(CAMERA, PANE), PaperSlip(1.4e-4, limit=1))
+        sequence = Renderer(CAMERA, PANE, **way).sequence(motion)
+        return [sequence.at(time) for time in times]
+
+    found = frames(everyone, (0.0, 0.5, 1.0, 2.0, 0.25))
+    assert [each.renderer.lasting for each in found] == [False, False, True, True, False]
+    assert found[0] is found[1]
+    assert found[2] is found[3]
+    for time, each in zip((0.0, 1.0, 0.25), (found[0], found[2], found[4]), strict=True):
+        for expected in (frames(everyone, (time,))[0], Renderer(CAMERA, PANE, lasting=time == 1).plan(each.drops)):
+            np.testing.assert_array_equal(each.apply(image), expected.apply(image))
+    assert frames(Drops(*columns), (0.0,))[0].renderer.lasting is True
+    assert frames(Drops(*columns), (0.0,), lasting=False)[0].renderer.lasting is False
+    assert frames(everyone, (0.0,), lasting=True)[0].renderer.lasting is True
 
 
 @needs_numba

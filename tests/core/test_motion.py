@@ -2,6 +2,7 @@
 
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from rainstereo.rain.evaporation import DRY_RADIUS, Evaporation
 from rainstereo.rain.meander import Meander
 from rainstereo.rain.motion import Motion, PaneState
 from rainstereo.rain.pane import Pane
-from rainstereo.rain.slip import HystereticSlip
+from rainstereo.rain.slip import HystereticSlip, PaperSlip
 from rainstereo.rain.streaks import Streak
 from rainstereo.rain.trail import Trail
 from rainstereo.rain.trail_path import TrailPath
@@ -336,6 +337,33 @@ def test_drops_at_rest_are_the_same_drops() -> None:
     assert running.size
     assert not np.isin(running, static).any()
     assert len(static) > 0.9 * len(early.drops)
+
+
+def test_a_pane_rests_when_nothing_is_to_change() -> None:
+    """From when the last has left, arrived, or parted with its trail; never while drops dry."""
+    small, large = drops_of([1.0, 2.0], [-0.01, 0.01]), drops_of([1.0, 6.0], [-0.01, 0.01])
+    later = replace(small, birth=np.array([0.0, 2.0]))
+    for drops, law, until in (
+        (small, PaperSlip(PIXEL), 0.0), (large, PaperSlip(PIXEL), None), (later, PaperSlip(PIXEL), 2.0),
+        (large, HystereticSlip(), None),
+    ):  # fmt: skip
+        motion = Motion(drops, PANE, law)
+        states = [motion.at(time) for time in np.arange(0, 60, 0.25)]
+        first = next(i for i, state in enumerate(states) if state.rests)
+        assert first > 0 if until is None else states[first].time == until
+        assert all(state.rests for state in states[first:])
+        for state in states[first:]:
+            np.testing.assert_array_equal(state.unchanged(states[-1]), states[-1].drops.id)
+            assert len(state.drops) == len(states[-1].drops)
+        assert not any(state.rests for state in states[:first])
+    trail = Motion(large, PANE, HystereticSlip(), Trail(life=3.0))
+    parted = [trail.at(time).rests for time in (0.0, 10.0, 60.0)]
+    assert parted[0] is False
+    assert parted[-1] is (not trail.at(60.0).trails and not trail.at(60.0).velocity.any())
+    dry, damp = (Motion(small, PANE, evaporation=Evaporation(humidity)) for humidity in (0.9, 1.0))
+    assert not dry.at(5.0).rests
+    assert damp.at(0.0).rests
+    assert Motion(drops_of([]), PANE, evaporation=Evaporation()).at(0.0).rests
 
 
 def test_drops_dry_by_the_square_of_their_diameter() -> None:
