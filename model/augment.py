@@ -97,11 +97,11 @@ class AdherentRainGenerator(RandomGeneratorBase):
         if drawn:
             _, pane = self.scene.seen(width, height)
             tables = [self._table(c, s, pane) for c, s in zip(covers.tolist(), seeds.tolist(), strict=True)]
-        most = max((len(table) for table in tables), default=0)
-        drops = torch.tensor(EMPTY, device="cpu").repeat(drawn, most, 1)
+        most = max(map(len, tables), default=0)
+        drops = np.full((drawn, most, len(EMPTY)), EMPTY, dtype=np.float32)
         for row, table in zip(drops, tables, strict=True):
-            row[: len(table)] = torch.from_numpy(table)
-        params = {"drops": drops.expand(count, -1, -1), "cover": covers.expand(count)}
+            row[: len(table)] = table
+        params = {"drops": torch.from_numpy(drops).expand(count, -1, -1), "cover": covers.expand(count)}
         if self.f_number is not None:
             # uniform in its logarithm, as the stops of a lens are
             low, high = (math.log(n) for n in self.f_number)
@@ -109,10 +109,9 @@ class AdherentRainGenerator(RandomGeneratorBase):
         return params
 
     def _table(self, cover: float, seed: int, pane: Pane) -> Array:
-        drops = self.scene.population.with_cover(cover).sample(seed, pane)
-        index = np.full(len(drops.x), drops.index)
-        table: Array = np.stack([drops.x, drops.y, drops.radius, drops.contact_angle, index], -1, dtype=np.float32)
-        return table
+        law = self.scene.population.with_cover(cover)
+        columns = law.columns(seed, pane)
+        return np.stack([*columns, np.full_like(columns[0], law.index)], -1, dtype=np.float32)
 
 
 class RandomAdherentRain(IntensityAugmentationBase2D):

@@ -14,6 +14,7 @@ from torch import Tensor
 from rainstereo.drop_grid import NOBODY
 from rainstereo.model.cap_table import CapTable
 from rainstereo.model.pane_rays import PaneOptics, PaneRays
+from rainstereo.model.tensor_rows import rows_at
 
 TILE = 8
 """Cells along a tile's side."""
@@ -126,7 +127,7 @@ class CapCircles:
             order = torch.empty_like(pairs).index_copy(0, pairs, torch.arange(len(pairs), device=pairs.device))
             drops = drops[order]
         else:
-            x, y = x[pairs], y[pairs]
+            x, y = rows_at(x, pairs), rows_at(y, pairs)
         dx, dy, reach = x - self.x[drops], y - self.y[drops], self.reach[drops]
         square = dx * dx + dy * dy
         bound = reach + (rays.middle.slope if alone else rays.middle.slope[pairs]).unsqueeze(1) * self.top[drops]
@@ -136,7 +137,7 @@ class CapCircles:
         outside = torch.where(can_meet, square - reach * reach, math.inf)
         rows = pairs.unsqueeze(1).expand_as(outside)
         least = torch.full_like(rays.x, math.inf).scatter_reduce(0, rows, outside, "amin")
-        mine = torch.where(can_meet & (outside == least[pairs]), drops, NOBODY)
+        mine = torch.where(can_meet & (outside == rows_at(least, pairs)), drops, NOBODY)
         return torch.full_like(rays.x, NOBODY, dtype=torch.int64).scatter_reduce(0, rows, mine, "amax")
 
     def touch(self, cells: Cells, rays: CellRays) -> Tensor:
@@ -176,14 +177,13 @@ def cells_near(caps: CapTable, canvas: Canvas, optics: PaneOptics) -> Cells:
 def _meetings(circles: CapCircles, reach: Tensor, tiles: Tensor, radius: Tensor, images: int) -> list[Tensor]:
     """Image, drop and tile, (P,) each, of all pairs that may meet; reach: (B D,). tiles: (T, 2), radius: (T,)."""
     # in single precision: this only has to find enough
-    centres = torch.stack([circles.x, circles.y], -1).float().reshape(images, -1, 2)
-    drops, everywhere = centres.shape[1], tiles.float().expand(images, -1, 2)
-    bound, size = reach.float().reshape(images, drops, 1), radius.float()
+    x, y, bound = (c.float().reshape(images, -1, 1) for c in (circles.x, circles.y, reach))
+    drops, (across, down), size = x.shape[1], tiles.float().unbind(-1), radius.float()
     step, found = max(1, PAIRS // max(1, images * len(radius))), [torch.zeros(0, 3, dtype=torch.int64).to(size.device)]
     for first in range(0, drops, step):
         some = slice(first, first + step)
-        distance = torch.cdist(centres[:, some], everywhere, compute_mode="donot_use_mm_for_euclid_dist")
-        pairs = (distance < bound[:, some] + size).nonzero()
+        square = (x[:, some] - across).square_().add_((y[:, some] - down).square_())
+        pairs = (square < (bound[:, some] + size).clamp_(min=0).square_()).nonzero()
         pairs[:, 1] += first
         found.append(pairs)
     return list(torch.cat(found).unbind(-1))

@@ -19,6 +19,7 @@ from rainstereo.model.drop_cover import Canvas, CapCircles, CellRays, Cells, cel
 from rainstereo.model.drop_trace import Trace, trace, trace_caps
 from rainstereo.model.image_pyramid import ImagePyramid
 from rainstereo.model.pane_rays import PaneOptics
+from rainstereo.model.tensor_rows import rows_at
 from rainstereo.model.thin_drop import thin_caps
 from rainstereo.patch import UNCOVERED
 from rainstereo.ray_bundle import Fate
@@ -58,7 +59,7 @@ class Samples:
 
     def take(self, at: Tensor) -> Samples:
         """Those of some cells."""
-        return Samples(self.source[at], self.gain[at], self.covered[at], self.owner[at])
+        return Samples(*(rows_at(each, at) for each in (self.source, self.gain, self.covered, self.owner)))
 
 
 class DropLooks:
@@ -99,7 +100,7 @@ class DropLooks:
         rays = CellRays.of(cells, side, self.optics)
         owner, shape = self.circles.owners(cells, rays), rays.x.shape
         at = (owner.reshape(-1) >= 0).nonzero().squeeze(-1)
-        which, given = owner.reshape(-1)[at], rays.pixels.reshape(-1, 2)[at].to(dtype)
+        which, given = owner.reshape(-1)[at], rows_at(rays.pixels.reshape(-1, 2), at).to(dtype)
         if self.model == "exact":
             t = trace_caps(given.unsqueeze(0), self.row, self.camera, self.chamber, self.depth, which=which[None])
             hidden = torch.ones_like(t.fate, dtype=torch.bool)
@@ -167,7 +168,7 @@ def _inside(pyramid: ImagePyramid, image: Tensor, samples: Samples, most: int) -
     colour = gain.new_zeros(len(gain), pyramid.colours.shape[1])
     for side in sides.tolist():
         at = (needed == side).nonzero().squeeze(-1)
-        looks = _spread(samples.source[at], side)
+        looks = _spread(rows_at(samples.source, at), side)
         weights = (gain[at] / side**2).unsqueeze(1).expand(-1, side**2)
         level = _level(pyramid, area[at] / side**2)
         colour = colour.index_copy(0, at, pyramid.sums(image[at], level, looks, weights))

@@ -46,17 +46,17 @@ class DropOwners:
             return torch.full_like(rays.fate, NOBODY, dtype=torch.int64)
         # single precision will do: whether the ray then meets its drop is decided elsewhere, in full
         reach, top = (c[images].detach().float().unsqueeze(1) for c in (self.reach, self.top))
-        centres = self.centres[images].detach().float()
-        points = torch.stack([rays.x, rays.y], -1).detach().float().reshape(count, -1, 2)
+        across, down = (c.unsqueeze(1) for c in self.centres[images].detach().float().unbind(-1))
+        x, y = (c.detach().float().reshape(count, -1, 1) for c in (rays.x, rays.y))
         slopes = _slope(rays, n1).float().reshape(count, -1, 1)
-        owners = torch.full(points.shape[:2], NOBODY, device=points.device)
-        pairs = PAIRS if points.device.type == "cpu" else PAIRS_ELSEWHERE
+        owners = torch.full(x.shape[:2], NOBODY, device=x.device)
+        pairs = PAIRS if x.device.type == "cpu" else PAIRS_ELSEWHERE
         step = max(1, pairs // (count * drops))
-        for begin in range(0, points.shape[1], step):
+        for begin in range(0, x.shape[1], step):
             some = slice(begin, begin + step)
-            distance = torch.cdist(points[:, some], centres, compute_mode="donot_use_mm_for_euclid_dist")
-            can_meet = distance < torch.addcmul(reach, slopes[:, some], top)
-            outside = torch.where(can_meet, distance * distance - reach * reach, math.inf)
+            square = (x[:, some] - across).square_().add_((y[:, some] - down).square_())
+            can_meet = square < torch.addcmul(reach, slopes[:, some], top).square_()
+            outside = torch.where(can_meet, square - reach * reach, math.inf)
             least, owner = outside.min(-1)
             owners[:, some] = torch.where(least < math.inf, numbers.gather(1, owner), NOBODY)
         return owners.reshape(-1)

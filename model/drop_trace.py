@@ -33,7 +33,7 @@ from rainstereo.ray_bundle import Fate
 from rainstereo.trace import ALONG
 from rainstereo.types import Array
 
-BLOCK, BLOCK_ELSEWHERE = 1 << 16, 1 << 20
+BLOCK, BLOCK_ELSEWHERE = 1 << 16, 1 << 22
 """Rays traced at a time: few enough for the processor's caches, on other devices enough to fill them."""
 
 

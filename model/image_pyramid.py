@@ -40,10 +40,11 @@ class ImagePyramid:
         image: (M,) whose colours. level: (M,) at which all looks of a pixel are taken. places: (M, n, 2) finite, in
         pixels of the image; beyond it the image is mirrored about its outermost pixels. weights: (M, n).
         """
-        sizes = torch.tensor(self.sizes, device=places.device)
-        ends = (sizes[:, 0] * sizes[:, 1]).cumsum(0)
-        first = image * ends[-1] + ends[level] - sizes[level, 0] * sizes[level, 1]
-        last = (sizes[level] - 1).unsqueeze(1)
+        widths, heights = torch.tensor(self.sizes, device=places.device).unbind(-1)
+        ends = (widths * heights).cumsum(0)
+        width, height = widths[level], heights[level]
+        first = image * ends[-1] + ends[level] - width * height
+        last = (torch.stack([width, height], -1) - 1).unsqueeze(1)
         scale = torch.exp2(level.to(places.dtype)).reshape(-1, 1, 1)
         at = (mirrored(places, self.sizes[0]) + 0.5) / scale - 0.5
         at = torch.minimum(at.clamp(min=0), last.to(at.dtype))
@@ -51,8 +52,8 @@ class ImagePyramid:
         share = at - corner
         step = torch.minimum(last, torch.ones_like(last))  # to the next column and row, where there is one
         x, y = share.unbind(-1)
-        here = first.unsqueeze(1) + corner[..., 1] * sizes[level, 0].unsqueeze(1) + corner[..., 0]
-        right, down = step[..., 0], step[..., 1] * sizes[level, 0].unsqueeze(1)
+        here = first.unsqueeze(1) + corner[..., 1] * width.unsqueeze(1) + corner[..., 0]
+        right, down = step[..., 0], step[..., 1] * width.unsqueeze(1)
         index = torch.stack([here, here + right, here + down, here + right + down], -1)
         weight = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], -1) * weights.unsqueeze(-1)
         return functional.embedding_bag(

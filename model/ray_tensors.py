@@ -15,6 +15,9 @@ from torch import Tensor
 from rainstereo.model import fresnel
 from rainstereo.ray_bundle import Fate
 
+MANY = 1 << 18
+"""Rays of which one mask more is cheaper than the columns that it would be applied to."""
+
 
 @dataclass(frozen=True, eq=False)
 class Rays:
@@ -82,5 +85,6 @@ class Rays:
 
 
 def is_empty(mask: Tensor) -> bool:
-    """Whether a mask is known to be set nowhere; only on the processor, since asking makes other devices wait."""
-    return mask.device.type == "cpu" and not bool(mask.any())
+    """Whether a mask is known to be set nowhere. Other devices than the processor wait for the answer, which pays for
+    many rays only."""
+    return (mask.device.type == "cpu" or mask.numel() >= MANY) and not bool(mask.any())

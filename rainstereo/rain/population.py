@@ -73,15 +73,19 @@ class Population(ABC):
 
         ValueError if more than a million would be expected.
         """
-        rng = np.random.default_rng(seed)
-        if not self.density() * pane.area <= MOST:
+        return Drops(*self.columns(seed, pane), panel=pane.panel, face=pane.face, index=self.index)
+
+    def columns(self, seed: int | np.random.Generator, pane: Pane) -> tuple[Array, Array, Array, Array]:
+        """x, y, radius and contact angle, (N,) each, of the drops that `sample` draws."""
+        rng, expected = np.random.default_rng(seed), self.density() * pane.area
+        if not expected <= MOST:
             raise ValueError(
-                f"{self.density() * pane.area:.3g} drops would be expected on {pane.area * 1e6:.4g} square mm; at most "
+                f"{expected:.3g} drops would be expected on {pane.area * 1e6:.4g} square mm; at most "
                 f"{MOST} are drawn. Check that sizes and pane are both in metres, or lower the cover"
             )
         x, y, radius = self._place(rng, pane)
         angles = cut_normal(rng, *self.contact_angle, self.hysteresis.receding, self.hysteresis.advancing, len(x))
-        return Drops(x, y, radius, angles, panel=pane.panel, face=pane.face, index=self.index)
+        return x, y, radius, angles
 
     @abstractmethod
     def _place(self, rng: np.random.Generator, pane: Pane) -> tuple[Array, Array, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -40,25 +41,26 @@ class LogNormal:
 
     def quantile(self, share: Array) -> Array:
         """The values, metres, below which these shares, 0 to 1, of the law lie."""
-        low, high = self._bounds(0)
+        low, high = _bounds(self, 0)
         value: Array = self.median * np.exp(self.spread * ndtri(low + (high - low) * share))
         return np.clip(value, self.smallest, self.largest)  # rounding
 
     def moment(self, order: float) -> float:
         """Mean of the value to a power, metres^order; exact."""
         raw = self.median**order * math.exp(0.5 * (order * self.spread) ** 2)
-        (low, high), (moved_low, moved_high) = self._bounds(0), self._bounds(order)
+        (low, high), (moved_low, moved_high) = _bounds(self, 0), _bounds(self, order)
         return float(raw * (moved_high - moved_low) / (high - low))
 
-    def _bounds(self, order: float) -> tuple[float, float]:
-        """Shares of the law, weighted by value^order, below the two cuts."""
-        if self.spread == 0:
-            return 0.0, 1.0
-        low, high = (
-            float(ndtr(math.log(end / self.median) / self.spread - order * self.spread))
-            for end in (self.smallest, self.largest)
-        )
-        return low, high
+
+@lru_cache(maxsize=64)  # a law is asked time and again
+def _bounds(law: LogNormal, order: float) -> tuple[float, float]:
+    """Shares of the law, weighted by value^order, below the two cuts."""
+    if law.spread == 0:
+        return 0.0, 1.0
+    low, high = (
+        float(ndtr(math.log(end / law.median) / law.spread - order * law.spread)) for end in (law.smallest, law.largest)
+    )
+    return low, high
 
 
 def cut_share(mean: Array, sigma: float, low: float, high: float) -> Array:

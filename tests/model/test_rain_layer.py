@@ -25,6 +25,7 @@ from rainstereo.model.drop_trace import trace, trace_caps
 from rainstereo.model.image_pyramid import ImagePyramid, mirrored
 from rainstereo.model.pane_rays import PaneOptics
 from rainstereo.model.rain_layer import RainLayer, render
+from rainstereo.model.tensor_rows import number_by_number
 from rainstereo.model.thin_drop import thin_caps
 from rainstereo.panel_plane import PanelFrame
 from rainstereo.patch import folded
@@ -295,6 +296,19 @@ def test_cells_are_found_in_parts(monkeypatch):
     assert set(zip(parts.pairs.tolist(), parts.drops.tolist(), strict=True)) == set(
         zip(whole.pairs.tolist(), whole.drops.tolist(), strict=True)
     )
+
+
+@pytest.mark.parametrize("shape", [(7,), (7, 2), (7, 3, 2), (7, 0), (1, 5)])
+def test_rows_number_by_number(shape):
+    """As torch takes them, gradients too; what a GPU does."""
+    table = torch.randn(shape, dtype=torch.float64, requires_grad=True)
+    at = torch.randint(shape[0], (11,), generator=torch.Generator().manual_seed(0))
+    found, expected = number_by_number(table, at), table[at]
+    assert torch.equal(found, expected)
+    weight = torch.randn_like(expected)
+    gradients = [torch.autograd.grad((each * weight).sum(), table)[0] for each in (found, expected)]
+    torch.testing.assert_close(*gradients)
+    assert number_by_number(table, at[:0]).shape == (0, *shape[1:])
 
 
 @pytest.mark.parametrize("place", [(0, "near"), (0, "far"), (1, "near"), (1, "far")])
