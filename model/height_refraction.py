@@ -31,7 +31,7 @@ class HeightCells:
     @classmethod
     def of(cls, drop: HeightMap, dtype: torch.dtype, device: torch.device) -> HeightCells:
         """The cells of a height map."""
-        cells = torch.from_numpy(np.moveaxis(drop._cells, -1, 0).copy())
+        cells = torch.from_numpy(drop.polynomials())
         wet = torch.from_numpy(drop._wet_cells.reshape(-1))
         return cls(drop, cells.to(device, dtype), wet.to(device))
 

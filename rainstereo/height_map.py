@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from . import compiled
 from .droplet import Drop, is_convex_hull
 from .types import Array, Indices, Mask
 
 STEEPEST = math.radians(89.0)
 INTERPOLATIONS = ("bicubic", "bilinear")
 MOST_STEPS = 100
+MANY = 512
+"""Places at a time from which a loop in machine code, which must be loaded first, is asked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +110,7 @@ class HeightMap(Drop):
             drop.centre, heights, spacing, interpolation, steps, panel=drop.panel, face=drop.face, index=drop.index
         )
 
-    @property
+    @cached_property
     def reach(self) -> float:
         """Half the grid's diagonal, or what of it is wet, metres."""
         half = (np.array(self.heights.shape) - 1) / 2
@@ -114,23 +118,33 @@ class HeightMap(Drop):
         # a wet node wets at most the cells around it
         return float(np.hypot(np.abs(rows - half[0]) + 1, np.abs(columns - half[1]) + 1).max()) * self.spacing
 
-    @cached_property
+    @property
     def top(self) -> float:
         """A little more than the greatest height on a lattice of 5 x 5 in each wet cell, metres."""
-        return 1.01 * max(float(height.max()) for height, _ in self._lattice)
+        return 1.01 * self._greatest[0]
 
-    @cached_property
+    @property
     def steepest(self) -> float:
         """A tenth more than the greatest slope on a lattice of 5 x 5 in each wet cell."""
-        return 1.1 * max(float(slope.max()) for _, slope in self._lattice)
+        return 1.1 * self._greatest[1]
 
     @cached_property
-    def _lattice(self) -> list[tuple[Array, Array]]:
-        """Heights and slopes at 5 x 5 places of all wet cells, (cells,) each."""
-        cells = np.flatnonzero(self._wet_cells)
-        places = [np.full(len(cells), share) for share in np.linspace(0, 1, 5)]
-        found = [self._polynomials(u, v, cells) for u in places for v in places]
-        return [(height, np.hypot(along_x, along_y)) for height, along_x, along_y in found]
+    def _greatest(self) -> tuple[float, float]:
+        """Height and slope, the greatest of 5 x 5 places of all wet cells."""
+        nodes, (down, across), wet = self._nodes, self._wet_cells.shape, self._wet_cells
+        height, square = 0.0, 0.0
+        for u in np.linspace(0, 1, 5):
+            ahead, tilt = (
+                sum(w * nodes[:, b : b + across] for b, w in enumerate(row)) for row in self._weights(u)
+            )  # fmt: skip
+            for v in np.linspace(0, 1, 5):
+                over, along = self._weights(v)
+                value, along_u = (sum(w * c[a : a + down] for a, w in enumerate(over)) for c in (ahead, tilt))
+                along_v = sum(w * ahead[a : a + down] for a, w in enumerate(along))
+                height = max(height, float(value[wet].max()))
+                square = max(square, float((along_u * along_u + along_v * along_v)[wet].max()))
+        unit = self._units
+        return height * unit[0], math.sqrt(square) * unit[1]
 
     @cached_property
     def volume(self) -> float:
@@ -148,44 +162,61 @@ class HeightMap(Drop):
         return is_convex_hull(points, normals, 1e-3 * self.top)
 
     @cached_property
-    def _cells(self) -> Array:
-        """Coefficients of each cell's polynomial sum c[p, q] v^p u^q, (4, 4, cells), heights in units of the spacing.
+    def _nodes(self) -> Array:
+        """What the surface is a weighted sum of, in units of the spacing: the coefficients of a bicubic spline of evenly
+        spaced knots, (H + 2, W + 2), which has no knot at the nodes next to the grid's edge; or the heights."""
+        heights = self.heights / self.spacing
+        return _spline(_spline(heights).T).T.copy() if self.interpolation == "bicubic" else heights
 
-        u, v run from 0 to 1 over a cell. A bicubic spline is fixed in a cell by its values, slopes and twists at the
-        corners.
+    @property
+    def _units(self) -> tuple[float, float]:
+        """What sums of `_nodes` with `_weights` twice are to be multiplied by: metres of heights, and slopes."""
+        return (self.spacing / 36, 1 / 12) if self.interpolation == "bicubic" else (self.spacing, 1.0)
+
+    def _weights(self, share: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """Of the nodes around places so far from one node to the next, 0 to 1: 6 times what a value takes, and twice
+        what its derivative does (C. de Boor, "A Practical Guide to Splines", 1978); 1 and 1 of bilinear maps."""
+        s, rest = share, 1 - share
+        if self.interpolation == "bilinear":
+            return (rest, s), (-1.0, 1.0)
+        square = s * s
+        cube = square * s
+        values = rest * rest * rest, 3 * cube - 6 * square + 4, 3 * (s + square - cube) + 1, cube
+        return values, (-(rest * rest), 3 * square - 4 * s, 2 * s - 3 * square + 1, square)
+
+    def polynomials(self) -> Array:
+        """Coefficients of each cell's polynomial sum c[p, q] v^p u^q, (cells, 4, 4), heights in units of the spacing.
+
+        u, v run from 0 to 1 over a cell.
         """
-        rows, columns = (np.arange(n, dtype=np.float64) for n in self.heights.shape)
-        h = self.heights / self.spacing
-        F = np.zeros((4, 4, len(rows) - 1, len(columns) - 1))
+        to_powers = np.zeros((4, 4))
         if self.interpolation == "bicubic":
-            from scipy.interpolate import RectBivariateSpline  # dear to import: by those only who need it
-
-            spline = RectBivariateSpline(rows, columns, h)
-            to_polynomial = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]], dtype=np.float64)
-            for dv in (0, 1):
-                for du in (0, 1):
-                    at = spline(rows, columns, dx=dv, dy=du)
-                    F[2 * dv, 2 * du], F[2 * dv, 2 * du + 1] = at[:-1, :-1], at[:-1, 1:]
-                    F[2 * dv + 1, 2 * du], F[2 * dv + 1, 2 * du + 1] = at[1:, :-1], at[1:, 1:]
+            to_powers[:] = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
         else:
-            to_polynomial = np.array([[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=np.float64)
-            F[0, 0], F[0, 1], F[1, 0], F[1, 1] = h[:-1, :-1], h[:-1, 1:], h[1:, :-1], h[1:, 1:]
-        coefficients = np.einsum("ap,pqij,bq->abij", to_polynomial, F, to_polynomial)
-        return np.ascontiguousarray(coefficients.reshape(4, 4, -1))
+            to_powers[:2, :2] = [[1, 0], [-1, 1]]
+        taps, (down, across) = 4 if self.interpolation == "bicubic" else 2, self._wet_cells.shape
+        windows = np.lib.stride_tricks.sliding_window_view(self._nodes, (taps, taps))
+        found = np.einsum("pa,ijab,qb->ijpq", to_powers[:, :taps], windows, to_powers[:, :taps], optimize=True)
+        return np.ascontiguousarray(found.reshape(down * across, 4, 4))
 
     def _interpolate(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Height, also below the face, and slopes; 0 height and slopes outside the grid."""
+        if len(x) >= MANY and self.interpolation == "bicubic" and compiled.available():
+            from rainstereo.compiled.height_map import interpolate
+
+            found = np.empty((3, len(x)), dtype=x.dtype)
+            interpolate(x, y, x.dtype.type(self.spacing), self._units[0], self._nodes, found)
+            return found[0], found[1], found[2]
         u, v = x / self.spacing, y / self.spacing
         rows, columns = self.heights.shape
-        u, v = u.astype(np.float64) + (columns - 1) / 2, v.astype(np.float64) + (rows - 1) / 2
+        u, v = u.astype(np.float64) + 0.5 * (columns - 1), v.astype(np.float64) + 0.5 * (rows - 1)
         with np.errstate(invalid="ignore"):
             inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
         everywhere = bool(inside.all())
         if not everywhere:
             u, v = u[inside], v[inside]
         i, j = np.minimum(v.astype(np.intp), rows - 2), np.minimum(u.astype(np.intp), columns - 2)
-        u, v, cell = u - j, v - i, i * (columns - 1) + j
-        values = self._polynomials(u, v, cell)
+        values = self._sums(u - j, v - i, i * self._nodes.shape[1] + j)
         if everywhere:
             height, sx, sy = (value.astype(x.dtype, copy=False) for value in values)
             return height, sx, sy
@@ -193,24 +224,23 @@ class HeightMap(Drop):
         out[:, inside] = values
         return out[0], out[1], out[2]
 
-    def _polynomials(self, u: Array, v: Array, cell: Indices) -> tuple[Array, Array, Array]:
-        terms = range(4 if self.interpolation == "bicubic" else 2)
-        height, along_v, along_u = np.zeros_like(u), np.zeros_like(u), np.zeros_like(u)
-        for p in reversed(terms):
-            row, slope = np.zeros_like(u), np.zeros_like(u)
-            for q in reversed(terms):
-                slope *= u
-                slope += row
-                row *= u
-                row += self._cells[p, q].take(cell, mode="clip")
-            along_v *= v
-            along_v += height
-            height *= v
-            height += row
-            along_u *= v
-            along_u += slope
-        height *= self.spacing
-        return height, along_u, along_v
+    def _sums(self, u: Array, v: Array, first: Indices) -> tuple[Array, Array, Array]:
+        """Height and slopes at places of cells; first: the first of the nodes around each, in their flat order."""
+        nodes, width = self._nodes.ravel(), self._nodes.shape[1]
+        (across, tilts), (over, alongs) = self._weights(u), self._weights(v)
+        height, along_u, along_v = np.zeros_like(u), np.zeros_like(u), np.zeros_like(u)
+        for a, (value, along) in enumerate(zip(over, alongs, strict=True)):
+            row, tilt = np.zeros_like(u), np.zeros_like(u)
+            for b, (w, d) in enumerate(zip(across, tilts, strict=True)):
+                node = nodes.take(first + (a * width + b), mode="clip")
+                tilt += d * node
+                node *= w
+                row += node
+            height += value * row
+            along_u += value * tilt
+            along_v += along * row
+        metres, slope = self._units
+        return height * metres, along_u * slope, along_v * slope
 
     def covers(self, x: Array, y: Array) -> Mask:
         """Where the interpolated height is above 0, and so is that of a neighbouring node."""
@@ -237,3 +267,13 @@ class HeightMap(Drop):
         wet = self.covers(x, y)
         height, sx, sy = self._interpolate(x, y)
         return np.where(wet, height, 0), np.where(wet, sx, 0), np.where(wet, sy, 0)
+
+
+def _spline(values: Array) -> Array:
+    """Coefficients, (N + 2, M), of cubic splines of evenly spaced knots through values, (N, M)."""
+    from scipy.interpolate import make_interp_spline  # dear to import: by those only who need it
+
+    places = np.arange(len(values), dtype=np.float64)
+    inner = values - make_interp_spline(places, values)(places, 2) / 6
+    first, last = (6 * values[e] - 4 * inner[e] - inner[n] for e, n in ((0, 1), (-1, -2)))
+    return np.concatenate([first[None], inner, last[None]])
