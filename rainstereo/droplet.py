@@ -10,12 +10,16 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from . import panel_plane
 from .chamber import Chamber
 from .types import Array, Mask
+
+if TYPE_CHECKING:
+    from .height_rays import HeightRays
 
 WATER = 1.333
 INDEX_RANGE = (0.5, 4.5)
@@ -102,6 +106,11 @@ class Drop(ABC):
         x, y, z: (N,) metres in the drop's coordinates, z >= 0 the height above the face. Metres near the surface, and
         smooth across the contact line, so that Newton's method finds surfaces and samples find edges.
         """
+
+    def rays(self, x: Array, y: Array, ux: Array, uy: Array) -> HeightRays | None:
+        """What meets rays through x, y of the face in less time than `level` does, (N,) each; None: nothing."""
+        del x, y, ux, uy
+        return None
 
     def check_fits(self, chamber: Chamber) -> None:
         """ValueError unless the chamber has the drop's face and room enough in front of it."""

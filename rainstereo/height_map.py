@@ -11,12 +11,13 @@ import numpy as np
 
 from . import compiled
 from .droplet import Drop, is_convex_hull
+from .height_rays import HeightRays
 from .types import Array, Indices, Mask
 
 STEEPEST = math.radians(89.0)
 INTERPOLATIONS = ("bicubic", "bilinear")
 MOST_STEPS = 100
-MANY = 512
+MANY = 64
 """Places at a time from which a loop in machine code, which must be loaded first, is asked."""
 
 
@@ -143,8 +144,8 @@ class HeightMap(Drop):
                 along_v = sum(w * ahead[a : a + down] for a, w in enumerate(along))
                 height = max(height, float(value[wet].max()))
                 square = max(square, float((along_u * along_u + along_v * along_v)[wet].max()))
-        unit = self._units
-        return height * unit[0], math.sqrt(square) * unit[1]
+        metres, slope = self._units
+        return height * metres, math.sqrt(square) * slope
 
     @cached_property
     def volume(self) -> float:
@@ -163,8 +164,8 @@ class HeightMap(Drop):
 
     @cached_property
     def _nodes(self) -> Array:
-        """What the surface is a weighted sum of, in units of the spacing: the coefficients of a bicubic spline of evenly
-        spaced knots, (H + 2, W + 2), which has no knot at the nodes next to the grid's edge; or the heights."""
+        """What the surface is a weighted sum of, in units of the spacing: the coefficients of a bicubic spline of
+        evenly spaced knots, (H + 2, W + 2), which has no knot at the nodes next to the grid's edge; or the heights."""
         heights = self.heights / self.spacing
         return _spline(_spline(heights).T).T.copy() if self.interpolation == "bicubic" else heights
 
@@ -256,6 +257,12 @@ class HeightMap(Drop):
     def _wet_cells(self) -> Mask:
         wet = self.heights > 0
         return np.asarray(wet[1:, 1:] | wet[1:, :-1] | wet[:-1, 1:] | wet[:-1, :-1])
+
+    def rays(self, x: Array, y: Array, ux: Array, uy: Array) -> HeightRays | None:
+        """Loops in machine code for many rays."""
+        if len(x) < MANY or self.interpolation != "bicubic" or not compiled.available():
+            return None
+        return HeightRays(x.dtype.type(self.spacing), self._units[0], self._nodes, x, y, ux, uy)
 
     def level(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Array, Array]:
         """Height of the surface, continued below the face, minus z; and its derivatives."""

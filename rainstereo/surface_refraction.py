@@ -10,6 +10,8 @@ can cross the surface only once, and from outside only where it crosses the wet 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from . import fresnel, types
@@ -136,6 +138,8 @@ def _bracket(drop: Drop, x: Array, y: Array, ux: Array, uy: Array, *, upwards: b
     if drop.is_convex:
         return low, high
     at = np.flatnonzero(~_gentle(drop, ux, uy))
+    if not at.size:
+        return low, high
     low[at], high[at] = _first_change(drop, x[at], y[at], ux[at], uy[at], low[at], high[at], upwards=upwards)
     return low, high
 
@@ -144,8 +148,12 @@ def _first_change(
     drop: Drop, x: Array, y: Array, ux: Array, uy: Array, low: Array, high: Array, *, upwards: bool
 ) -> tuple[Array, Array]:
     """A bracket narrowed, by samples, to the first crossing of several."""
+    heights = _heights(drop, x.dtype)
+    if (loops := drop.rays(x, y, ux, uy)) is not None:
+        loops.first_change(heights, upwards, low, high)
+        return low, high
     found = np.zeros(len(x), dtype=np.bool_)
-    for t in _heights(drop) if upwards else _heights(drop)[::-1]:
+    for t in heights if upwards else heights[::-1]:
         inside = drop.level(x + t * ux, y + t * uy, np.full_like(x, t))[0] > 0
         np.copyto(low, t, where=inside & ~found)
         np.copyto(high, t, where=~inside & ~found & ~(high < low))
@@ -161,8 +169,8 @@ def _gentle(drop: Drop, ux: Array, uy: Array) -> types.Mask:
     return np.asarray((ux * ux + uy * uy) * (drop.steepest * drop.steepest) < 1)
 
 
-def _heights(drop: Drop) -> Array:
-    return np.linspace(0.0, drop.top * (1 + 1e-6), SAMPLES + 1)[1:]
+def _heights(drop: Drop, dtype: Any) -> Array:
+    return np.linspace(0.0, drop.top * (1 + 1e-6), SAMPLES + 1)[1:].astype(dtype)
 
 
 def _deepest(drop: Drop, x: Array, y: Array, ux: Array, uy: Array) -> tuple[Array, Array]:
@@ -171,7 +179,9 @@ def _deepest(drop: Drop, x: Array, y: Array, ux: Array, uy: Array) -> tuple[Arra
     def level(t: Array) -> Array:
         return drop.level(x + t * ux, y + t * uy, t)[0]
 
-    heights = _heights(drop)
+    heights = _heights(drop, x.dtype)
+    if (loops := drop.rays(x, y, ux, uy)) is not None:
+        return loops.deepest(heights, GOLDEN, REFINEMENTS)
     best, t = np.full_like(x, -np.inf), np.zeros_like(x)
     for height in heights:
         value = level(np.full_like(x, height))
@@ -191,8 +201,10 @@ def _deepest(drop: Drop, x: Array, y: Array, ux: Array, uy: Array) -> tuple[Arra
 def meet(drop: Drop, x: Array, y: Array, ux: Array, uy: Array, low: Array, high: Array) -> Array:
     """Height at which each ray meets the surface, within its bracket, to rounding."""
     low, high = low.copy(), high.copy()
-    t = 0.5 * (low + high)
     tolerance = 2 * float(np.finfo(x.dtype).eps) * drop.top
+    if (loops := drop.rays(x, y, ux, uy)) is not None:
+        return loops.meet(low, high, tolerance, ITERATIONS)
+    t = 0.5 * (low + high)
     active = np.flatnonzero(np.isfinite(t))
     for _ in range(ITERATIONS):
         if not active.size:
@@ -217,8 +229,12 @@ def _rises_above(drop: Drop, x: Array, y: Array, ux: Array, uy: Array, start: Ar
     if not at.size:
         return under
     x, y, ux, uy = x[at], y[at], ux[at], uy[at]
-    begin = start[at] if isinstance(start, np.ndarray) else start
-    for t in np.linspace(0.0, drop.top, SAMPLES + 1)[1:]:
+    begin = start[at] if isinstance(start, np.ndarray) else np.full_like(x, start)
+    heights = np.linspace(0.0, drop.top, SAMPLES + 1)[1:].astype(x.dtype)
+    if (loops := drop.rays(x, y, ux, uy)) is not None:
+        under[at] = loops.rises_above(heights, begin, SLACK * drop.top)
+        return under
+    for t in heights:
         level = drop.level(x + t * ux, y + t * uy, np.full_like(x, t))[0]
         under[at] |= (level > SLACK * drop.top) & (t > begin)
     return under
