@@ -1,0 +1,126 @@
+"""Height maps as sums of splines, and rays that meet them in machine code: against scipy, and numpy to the bit."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import RectBivariateSpline
+
+from rainstereo import Camera, Chamber, Panel, compiled, height_map, surface_refraction
+from rainstereo.droplet import SphericalCap
+from rainstereo.height_map import HeightMap
+from rainstereo.trace import trace
+
+SIDE = 33
+needs_numba = pytest.mark.skipif(not compiled.available(), reason="needs numba")
+
+
+def bumpy(seed: int, *, steps: int | None = None, face: str = "far") -> HeightMap:
+    """A body with dents, dry at its edge."""
+    rng, along = np.random.default_rng(seed), np.linspace(-1, 1, SIDE)
+    x, y = np.meshgrid(along, along[: SIDE - 6])
+    waves = sum(
+        np.cos(a * x + b * y + c) for a, b, c in zip(*rng.normal(0, 5, (2, 4)), rng.uniform(0, 7, 4), strict=True)
+    )
+    heights = 4e-4 * (1 - x * x - (y / along[SIDE - 7]) ** 2) + 4e-5 * waves - 6e-5
+    heights[[0, -1]] = np.minimum(heights[[0, -1]], 0)
+    heights[:, [0, -1]] = np.minimum(heights[:, [0, -1]], 0)
+    return HeightMap((0.0, 0.0), heights, 7e-5, steps=steps, face=face)
+
+
+def places(drop: HeightMap, seed: int, count: int, dtype: type = np.float64) -> np.ndarray:
+    half = 0.5 * drop.spacing * (np.array(drop.heights.shape[::-1]) - 1)
+    return np.random.default_rng(seed).uniform(-half, half, (count, 2)).T.astype(dtype)
+
+
+@pytest.mark.parametrize("loops", [pytest.param(True, marks=needs_numba), False])
+def test_the_surface_is_scipys_spline(monkeypatch: pytest.MonkeyPatch, loops: bool) -> None:
+    """One without a knot next to the edge, as scipy makes them with its own basis; slopes are its derivatives."""
+    monkeypatch.setattr(height_map, "MANY", 1 if loops else 10**9)
+    drop = bumpy(1)
+    x, y = places(drop, 2, 4000)
+    rows, columns = (drop.spacing * (np.arange(n) - 0.5 * (n - 1)) for n in drop.heights.shape)
+    spline = RectBivariateSpline(rows, columns, drop.heights)
+    height, sx, sy = drop._interpolate(x, y)
+    np.testing.assert_allclose(height, spline(y, x, grid=False), rtol=0, atol=1e-16)
+    np.testing.assert_allclose(sx, spline(y, x, dy=1, grid=False), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(sy, spline(y, x, dx=1, grid=False), rtol=0, atol=1e-11)
+    beyond = np.full(70, 0.51 * drop.spacing * SIDE)
+    for at in (beyond, np.full(70, np.nan), np.full(70, np.inf)):
+        assert not any(part.any() for part in drop._interpolate(at, np.zeros(70)))
+
+
+@pytest.mark.parametrize("interpolation", height_map.INTERPOLATIONS)
+def test_polynomials_of_cells(interpolation: str) -> None:
+    drop = HeightMap((0.0, 0.0), bumpy(3).heights, 7e-5, interpolation)
+    rows, columns = drop.heights.shape
+    u, v = np.random.default_rng(4).uniform(0, 1, (2, (rows - 1) * (columns - 1)))
+    i, j = (index.ravel() for index in np.indices((rows - 1, columns - 1)))
+    x, y = (drop.spacing * (at - 0.5 * (n - 1)) for at, n in ((u + j, columns), (v + i, rows)))
+    expected = drop._interpolate(x, y)
+    powers_u, powers_v = (share[:, None] ** np.arange(4) for share in (u, v))
+    steps_u, steps_v = (np.arange(4) * share[:, None] ** np.array([0, 0, 1, 2]) for share in (u, v))
+    for a, b, unit, found in zip(
+        (powers_v, powers_v, steps_v), (powers_u, steps_u, powers_u), (drop.spacing, 1, 1), expected, strict=True
+    ):
+        value = unit * np.einsum("np,npq,nq->n", a, drop.polynomials(), b)
+        np.testing.assert_allclose(value, found, rtol=0, atol=1e-10 * unit)
+
+
+@pytest.mark.parametrize("interpolation", height_map.INTERPOLATIONS)
+def test_nothing_is_higher_or_steeper(interpolation: str) -> None:
+    """Than the greatest of lattices say, which a denser one can pass by little; and both are reached."""
+    drop = HeightMap((0.0, 0.0), bumpy(5).heights, 7e-5, interpolation)
+    x, y = places(drop, 6, 100_000)
+    height, sx, sy = drop.surface(x, y)
+    assert 0.98 * drop.top < height.max() < drop.top
+    assert 0.8 * drop.steepest < np.hypot(sx, sy).max() < drop.steepest
+
+
+def test_a_map_keeps_little() -> None:
+    """A body of rain that merged has a million nodes."""
+    drop = bumpy(7)
+    x, y = places(drop, 8, 100)
+    _ = drop.top, drop.steepest, drop.reach, drop.surface(x, y)
+    assert sum(each.nbytes for each in vars(drop).values() if isinstance(each, np.ndarray)) < 2.6 * drop.heights.nbytes
+    assert not any(isinstance(each, list) for each in vars(drop).values())
+
+
+@needs_numba
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([np.float32, np.float64]), st.floats(0.05, 3))
+def test_loops_find_what_numpy_does(seed: int, dtype: type, slope: float) -> None:
+    drop, rng = bumpy(seed), np.random.default_rng(seed + 1)
+    x, y = places(drop, seed + 2, 300, dtype)
+    ux, uy = rng.normal(0, slope, (2, 300)).astype(dtype)
+    start = rng.uniform(0, drop.top, 300).astype(dtype)
+
+    def found(many: int) -> list[np.ndarray]:
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(height_map, "MANY", many)
+            up, down = (surface_refraction._bracket(drop, x, y, ux, uy, upwards=way) for way in (True, False))
+            return [
+                *up, *down, *surface_refraction._deepest(drop, x, y, ux, uy), *drop._interpolate(x, y),
+                surface_refraction.meet(drop, x, y, ux, uy, *up), surface_refraction.meet(drop, x, y, ux, uy, *down),
+                surface_refraction._rises_above(drop, x, y, ux, uy, start),
+                surface_refraction._rises_above(drop, x, y, ux, uy, 0.0),
+            ]  # fmt: skip
+
+    for one, other in zip(found(1), found(10**9), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+
+
+@needs_numba
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("face", ["near", "far"])
+def test_a_trace_is_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch, face: str, dtype: type) -> None:
+    camera, pane = Camera.pinhole(900, 900, 79.5, 59.5, 160, 120), Chamber((0.2, 0.3, 1), 0.05, (Panel(0.003, 1.49),))
+    pixels = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), -1).astype(dtype)
+    drops = [bumpy(9, face=face), SphericalCap((-2.5e-3, 0), 5e-4, 0.9, face=face)]
+    quick = trace(pixels, drops, camera, pane, 5.0)
+    monkeypatch.setattr(height_map, "MANY", 10**9)
+    slow = trace(pixels, drops, camera, pane, 5.0)
+    assert (quick.status == 0).sum() > 500
+    for name in ("status", "source", "transmittance"):
+        np.testing.assert_array_equal(getattr(quick, name), getattr(slow, name))
