@@ -112,6 +112,9 @@ class Drop(ABC):
         del x, y, ux, uy
         return None
 
+    def let_go(self) -> None:  # noqa: B027  most have nothing
+        """Give up what was made for tracing and takes memory, if there is anything; it is made anew where needed."""
+
     def check_fits(self, chamber: Chamber) -> None:
         """ValueError unless the chamber has the drop's face and room enough in front of it."""
         self.check_room(panel_plane.room(chamber, self.panel, self.face))

@@ -132,7 +132,7 @@ class HeightMap(Drop):
     @cached_property
     def _greatest(self) -> tuple[float, float]:
         """Height and slope, the greatest of 5 x 5 places of all wet cells."""
-        nodes, (down, across), wet = self._nodes, self._wet_cells.shape, self._wet_cells
+        nodes, (down, across), wet = self._made_nodes(), self._wet_cells.shape, self._wet_cells
         height, square = 0.0, 0.0
         for u in np.linspace(0, 1, 5):
             ahead, tilt = (
@@ -166,6 +166,13 @@ class HeightMap(Drop):
     def _nodes(self) -> Array:
         """What the surface is a weighted sum of, in units of the spacing: the coefficients of a bicubic spline of
         evenly spaced knots, (H + 2, W + 2), which has no knot at the nodes next to the grid's edge; or the heights."""
+        return self._made_nodes()
+
+    def let_go(self) -> None:
+        """Give up what rays need; whoever traces the drop again makes it anew."""
+        self.__dict__.pop("_nodes", None)
+
+    def _made_nodes(self) -> Array:
         heights = self.heights / self.spacing
         return _spline(_spline(heights).T).T.copy() if self.interpolation == "bicubic" else heights
 

@@ -69,6 +69,8 @@ class BlurredLayer:
 
         made = defocused(drops, camera, chamber, lens, depth, border=border, tracer=trace)
         kept = traced[0] if traced else None
+        for drop in drops:
+            drop.let_go()
         give_back()
         if shift == (0, 0) and size == camera.size:
             return cls(drops, made, made, shift, kept)

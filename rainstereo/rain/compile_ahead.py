@@ -9,7 +9,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from rainstereo import compiled
 from rainstereo.camera import Camera
 from rainstereo.chamber import Chamber, Panel
 from rainstereo.droplet import SphericalCap
+from rainstereo.height_rays import HeightRays
 from rainstereo.types import Indices
 
 from .cells import LARGEST
@@ -62,6 +63,7 @@ def compile_here(way: Way) -> None:
     """Trace a pixel, find the taps of one, order, pack and draw them; or draw a moving drop, and tell its pixels."""
     camera, pane = Camera.pinhole(SPAN, SPAN, 0, 0, SIDE, SIDE), Chamber((0, 0, 1), 0.05, (Panel(0.002, 1.5),))
     cap = SphericalCap((0, 0), 0.001, 0.5)
+    _meet_bodies()
     if way == "moving":
         from .render import Renderer  # which needs this module
 
@@ -78,6 +80,20 @@ def compile_here(way: Way) -> None:
     sums.taps(x, y, np.full(x.shape, 1 / SIDE**2, dtype=np.float32))
     _draw()
     give_back()
+
+
+def _meet_bodies() -> None:
+    """What rays do that meet drops which merged."""
+    from rainstereo.compiled.height_map import interpolate
+
+    one: Any = np.zeros(1, dtype=np.float32)
+    nodes = np.zeros((6, 6))
+    rays = HeightRays(np.float32(1), 1.0, nodes, one, one, one, one)
+    interpolate(one, one, np.float32(1), 1.0, nodes, np.zeros((3, 1), dtype=np.float32))
+    rays.first_change(one, True, one, one)
+    rays.rises_above(one, one, 1.0)
+    rays.deepest(one, 0.5, 1)
+    rays.meet(one, one, 1.0, 1)
 
 
 def _draw() -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from rainstereo import compiled
 from rainstereo.camera import Camera
-from rainstereo.caps import some_of
+from rainstereo.caps import Caps, some_of
 from rainstereo.chamber import Chamber
 from rainstereo.drop_grid import NOBODY
 from rainstereo.droplet import Drop
@@ -104,6 +104,12 @@ class Batch:
         pieces = [slice(a, b) for a, b in pairwise([*cuts, len(self.pixels)])]
         return [Batch(self.drops, self.pixels[p], self.groups[p], self.which[p], kept=self.kept) for p in pieces]
 
+    def let_go(self) -> None:
+        """Give up what tracing its drops needed."""
+        if not isinstance(self.drops, Caps):
+            for number in range(len(self.drops)) if self.which is None else np.unique(self.which).tolist():
+                self.drops[number].let_go()
+
 
 def rays_along(tolerance: float) -> int:
     """Rays along a pixel's side."""
@@ -171,6 +177,7 @@ class Minifier:
             return False
         for part in (part for batch in batches for part in batch.parts()):
             room -= np.count_nonzero(self._kinds(part) == LIT)
+            part.let_go()
         return room < 0
 
     def _dearer(self, batches: Sequence[Batch]) -> float:
@@ -185,6 +192,7 @@ class Minifier:
             if rows.size:
                 taps += len(self._of_rows(batch, rows, rays_along(self.tolerance)).texels)
                 seen += len(rows)
+                batch.let_go()
         return float(max(taps / seen * count / room, 1.0) ** FALLS)
 
     def _narrow(self, tables: list[Lookups], wide: list[Lookups]) -> None:
@@ -221,6 +229,8 @@ class Minifier:
             pending.append(part)
             if i == len(parts) - 1 or sum(len(some.pixels) for some in pending) >= TOGETHER:
                 yield from (table for table in in_order(self._of_some(pending)) if len(table.pixels))
+                for done in pending:
+                    done.let_go()
                 pending = []
 
     def _of_some(self, batches: Sequence[Batch]) -> Iterator[Callable[[], Lookups]]:

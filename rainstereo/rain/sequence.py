@@ -55,14 +55,19 @@ class Sequence:
         self._layers: dict[Key, BlurredLayer] = {}
         self._last: Plan | None = None
         self._rested = True
+        self._rest: tuple[float, Plan] | None = None  # from when on the pane is the same
         self._shapes = PaneShapes()
 
     def at(self, time: float) -> Plan:
         """The plan for a time of the motion, seconds."""
         if self.motion is None:
             raise ValueError("this sequence has no motion; make it with Renderer.sequence(motion), or use `plan`")
+        if self._rest is not None and time >= self._rest[0] and self._rest[1] is self._last:
+            return self._last
         state = self.motion.at(time)
-        return self.plan(self._shapes.of(state), state.rests)
+        plan = self.plan(self._shapes.of(state), state.rests)
+        self._rest = (time, plan) if state.rests else None
+        return plan
 
     def plan(self, drops: AnyDrops, rests: bool = True) -> Plan:
         """The plan for the next frame's drops. rests: whether they stay from now on, for all that is known."""

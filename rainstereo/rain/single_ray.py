@@ -78,6 +78,7 @@ class SingleRay:
             there, share = np.flatnonzero(covered), covered / len(samples_there.gain)
             at, share = rows[there], share[there].astype(np.float32)
             found.append(self._edges(batch.pixels[at], batch.groups[at], samples_there.take(there), share))
+            batch.let_go()
         return [table for part in found for table in part if len(table.pixels)]
 
     # -- caps on one far face ------------------------------------------------------------------------------------------
