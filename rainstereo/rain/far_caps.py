@@ -115,7 +115,8 @@ class FarCaps:
     def _grid(self, pixels: Indices) -> tuple[Any, ...]:
         """Which caps are where on the face, for rays of these pixels."""
         if not len(pixels):
-            none = np.zeros((4, 0), dtype=np.float32), np.zeros((0, 0), dtype=np.int64), np.zeros(0, dtype=np.int64)
+            nobody = np.zeros(0, dtype=np.int32)
+            none = np.zeros((4, 0), dtype=np.float32), np.zeros(0, dtype=np.int64), nobody, nobody
             return np.zeros(2, dtype=np.float32), np.float32(1), np.zeros(2, dtype=np.int64), *none
         kx, ky, kz = self._directions(pixels, 1)
         square = (kx * kx + ky * ky) / (kz * kz)  # of the slope in the air before the panels, and so behind them
@@ -124,5 +125,5 @@ class FarCaps:
             margin = min(STEEPER * steepest, STEEPEST)
             self.grids[:] = [DropGrid(range(len(self.drops)), self.drops, self.origin, margin)]
         grid = self.grids[0]
-        low, table = grid.low.astype(np.float32), np.ascontiguousarray(grid.table, dtype=np.float32)
-        return low, np.float32(grid.cell), grid.size.astype(np.int64), table, grid.candidates, grid.numbers
+        low, size = grid.low.astype(np.float32), grid.size.astype(np.int64)
+        return low, np.float32(grid.cell), size, grid.table, grid.starts, grid.candidates, grid.numbers
