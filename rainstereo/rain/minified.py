@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -117,6 +118,7 @@ class Minifier:
     depth: of the scene, metres. tolerance: gray levels RMS. source_size, shift: of the image that holds the scene,
     (width, height), and the place of the camera's image in it. border: "mirror" or "edge".
     lasting: whether it is worth much time to find few texels. dearer: times that these must be worth more than usual.
+    clear: see `_clear_map`.
     """
 
     camera: Camera
@@ -128,9 +130,11 @@ class Minifier:
     border: str = "mirror"
     lasting: bool = False
     dearer: float = 1.0
+    clear: Any = None
 
     def __post_init__(self) -> None:
-        self.clear = _clear_map(self.camera, self.chamber)
+        if self.clear is None:
+            self.clear = _clear_map(self.camera, self.chamber)
 
     def lookups(self, batches: Sequence[Batch]) -> list[Lookups]:
         """What every pixel of the batches that a drop covers looks at."""
