@@ -15,6 +15,7 @@ NOBODY = -1
 BLOCK = 1 << 13  # drops that are sorted at a time
 CELLS = 256  # along each side, at most
 ROUNDING = 1e-5  # of the reach: single precision must not lose a ray at the rim
+SLACK = 1e-3  # of a cell, that a ray may be beside it, for the same reason
 
 
 class DropGrid:
@@ -26,6 +27,8 @@ class DropGrid:
     it belongs to the one it is closest to, in the same sense, of those that it can meet: that stand no farther away
     than it moves along the face over their height.
 
+    Where drops hide one another, few can win: a cell has those alone, and a drop that no cell has is left out.
+
     given: numbers of the drops. margin: greatest slope, against the normal, of the rays that will ask.
     """
 
@@ -35,33 +38,56 @@ class DropGrid:
         reach, top = (numbers_of(drops, name) for name in ("reach", "top"))
         first = np.lexsort((reach, *centres.T, -top))  # of equals, `whose` takes the first
         numbers, centres, reach, top = numbers[first], centres[first], reach[first], top[first]
-        self.numbers = np.append(numbers, np.int32(NOBODY))
         wide = reach + margin * top
-        # single precision will do: whether a ray then meets its drop is decided elsewhere, in full
-        self.table = np.stack([*centres.T, reach, top], dtype=np.float32, casting="same_kind")
         self.low = (centres - wide[:, None]).min(0)
         extent = (centres + wide[:, None]).max(0) - self.low
         self.cell = max(float(np.median(wide)), float(extent.max()) / CELLS)
         self.size = np.maximum(np.ceil(extent / self.cell).astype(int), 1)
-        self.starts, self.candidates = self._sort(centres, wide)
+        self.slack = SLACK * self.cell + 1e-6 * float(np.abs([self.low, self.low + extent]).max())
+        self.starts, self.candidates = self._sort(centres, reach, wide)
+        wins = np.zeros(len(numbers), dtype=np.bool_)
+        wins[self.candidates] = True
+        self.candidates = (np.cumsum(wins, dtype=np.int32) - np.int32(1))[self.candidates]
+        self.numbers = np.append(numbers[wins], np.int32(NOBODY))
+        # single precision will do: whether a ray then meets its drop is decided elsewhere, in full
+        self.table = np.stack([each[wins] for each in (*centres.T, reach, top)], dtype=np.float32, casting="same_kind")
 
-    def _sort(self, centres: Array, wide: Array) -> tuple[Indices, Indices]:
-        """Rows of the drops that reach each cell, cell by cell, and where those of each cell start, (cells + 2,); the
-        last cell, which has none, is outside everything."""
+    def _sort(self, centres: Array, reach: Array, wide: Array) -> tuple[Indices, Indices]:
+        """Rows of the drops that can win in each cell, cell by cell, and where those of each cell start, (cells + 2,);
+        the last cell, which has none, is outside everything."""
         cells = int(self.size.prod())
+        best = np.full(cells, np.inf)
+        for cell, row in self._reached(centres, wide):
+            far = np.hypot(*(np.abs(at) + (0.5 * self.cell + self.slack) for at in self._away(cell, centres[row])))
+            whole = far < reach[row]  # any ray in the cell is in the drop's circle, and so deep at least:
+            cell, row, far = cell[whole], row[whole], far[whole]
+            np.minimum.at(best, cell, far**2 - (1 - 2 * ROUNDING) * reach[row] ** 2)
+
+        def winning() -> Iterator[tuple[Indices, Indices]]:
+            for cell, row in self._reached(centres, wide):
+                aside = (np.abs(at) - (0.5 * self.cell + self.slack) for at in self._away(cell, centres[row]))
+                near = np.hypot(*(np.maximum(at, 0) for at in aside))
+                wins = near**2 - (1 + 2 * ROUNDING) * reach[row] ** 2 <= best[cell]
+                yield cell[wins], row[wins]
+
         starts: Indices = np.zeros(cells + 2, dtype=np.int64)
-        for cell, _ in self._reached(centres, wide):
+        for cell, _ in winning():
             starts[1:-1] += np.bincount(cell, minlength=cells)
         np.cumsum(starts, out=starts)
         starts[-1] = starts[-2]
         found: Indices = np.empty(starts[-1], dtype=np.int32)
         free = starts[:-2].copy()
-        for cell, row in self._reached(centres, wide):
+        for cell, row in winning():
             order = np.argsort(cell, kind="stable")
             cell, row = cell[order], row[order]
             found[free[cell] + np.arange(len(cell)) - np.searchsorted(cell, cell)] = row
             free += np.bincount(cell, minlength=cells)
         return starts, found
+
+    def _away(self, cell: Indices, points: Array) -> Array:
+        """From the middles of cells to points, (P, 2), as (2, P)."""
+        middle = np.stack([cell % self.size[0], cell // self.size[0]], -1) + 0.5
+        return np.asarray((points - self.low - middle * self.cell).T)
 
     def _reached(self, centres: Array, wide: Array) -> Iterator[tuple[Indices, Indices]]:
         """Cells that drops reach, and the drops' rows, (P,) each, of some drops at a time."""

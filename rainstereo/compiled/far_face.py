@@ -31,7 +31,7 @@ def look(
 ) -> None:  # fmt: skip
     """Write where side x side rays of each pixel look, (K, M, 2) float32, and gain and opacity, (K, M) float32.
 
-    pixels: (M,) int64 numbers in rows of `width`. which: (M,) int64 cap that a pixel may meet; empty: by the grid.
+    pixels: (M,) int64 numbers in rows of `width`. which: (M,) int64 cap that a pixel may meet; empty: by the grid, whose these are.
     directions: (3, K M) float64 in the panel frame; empty: of a pinhole, `to_panel`, (3, 3), times (u - c_x, v - c_y,
     1). lens: (2,) c_x, c_y. before: (F, 3) float64, distance along the normal and the indices on both sides, of the
     faces up to the caps', which is the last. caps: (N, 6) float64 centre in the panel frame, contact radius squared,
@@ -142,9 +142,9 @@ def whose(rays: Any, ray: Any, face: Any, grid: Any) -> Any:
     """The cap that a ray at the face may meet, -1 for none: `DropGrid.whose`, and the slope that it is asked with.
 
     grid: a `DropGrid`'s low, (2,) float32; cell, float32; size, (2,) int64; table, (4, N) float32; starts, (C + 2,)
-    int64; candidates, (P,) int32; and numbers, (N + 1,) int32.
+    int64; and candidates, (P,) int32.
     """
-    low, side, cells, table, starts, candidates, numbers = grid
+    low, side, cells, table, starts, candidates = grid
     x, y = np.float32(rays[X + ray]), np.float32(rays[Y + ray])
     u, v = (x - low[0]) / side, (y - low[1]) / side
     if not (u >= 0 and u < cells[0] and v >= 0 and v < cells[1]):
@@ -161,7 +161,7 @@ def whose(rays: Any, ray: Any, face: Any, grid: Any) -> Any:
         deep, near = square - reach * reach, (reach + slope * table[3, row]) * (np.float32(1) + ROUNDING)
         if deep < best and square < near * near:
             owner, best = np.int64(row), deep
-    return np.int64(numbers[owner]) if owner >= 0 else NOBODY
+    return owner
 
 
 @fused_part
