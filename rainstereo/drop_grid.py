@@ -59,9 +59,8 @@ class DropGrid:
         best = np.full(cells, np.inf)
         for cell, row in self._reached(centres, wide):
             far = np.hypot(*(np.abs(at) + (0.5 * self.cell + self.slack) for at in self._away(cell, centres[row])))
-            whole = far < reach[row]  # any ray in the cell is in the drop's circle, and so deep at least:
-            cell, row, far = cell[whole], row[whole], far[whole]
-            np.minimum.at(best, cell, far**2 - (1 - 2 * ROUNDING) * reach[row] ** 2)
+            whole = far < reach[row]  # then any ray in the cell lies in the drop's circle, and so deep at least
+            np.minimum.at(best, cell[whole], (far**2 - (1 - 2 * ROUNDING) * reach[row] ** 2)[whole])
 
         def winning() -> Iterator[tuple[Indices, Indices]]:
             for cell, row in self._reached(centres, wide):
@@ -79,8 +78,8 @@ class DropGrid:
         free = starts[:-2].copy()
         for cell, row in winning():
             order = np.argsort(cell, kind="stable")
-            cell, row = cell[order], row[order]
-            found[free[cell] + np.arange(len(cell)) - np.searchsorted(cell, cell)] = row
+            of_cell = cell[order]
+            found[free[of_cell] + np.arange(len(cell)) - np.searchsorted(of_cell, of_cell)] = row[order]
             free += np.bincount(cell, minlength=cells)
         return starts, found
 
@@ -128,4 +127,5 @@ class DropGrid:
             at = at[closer]
             best[at] = depth[closer]
             owner[at] = row[closer]
-        return self.numbers[owner].astype(np.intp)
+        numbers: Indices = self.numbers[owner].astype(np.intp)
+        return numbers

@@ -31,13 +31,13 @@ def look(
 ) -> None:  # fmt: skip
     """Write where side x side rays of each pixel look, (K, M, 2) float32, and gain and opacity, (K, M) float32.
 
-    pixels: (M,) int64 numbers in rows of `width`. which: (M,) int64 cap that a pixel may meet; empty: by the grid, whose these are.
-    directions: (3, K M) float64 in the panel frame; empty: of a pinhole, `to_panel`, (3, 3), times (u - c_x, v - c_y,
-    1). lens: (2,) c_x, c_y. before: (F, 3) float64, distance along the normal and the indices on both sides, of the
-    faces up to the caps', which is the last. caps: (N, 6) float64 centre in the panel frame, contact radius squared,
-    depth of the sphere's centre, 1 / its radius, index. later: (F, 3) thickness before a face and the indices on both
-    sides. grid: see `whose`. to_image: (3, 3) from the panel frame. view: (4,) c_x, c_y, distance of the last face,
-    1 / depth. clear: (M,) float64 what reaches each pixel through the bare panels.
+    pixels: (M,) int64 numbers in rows of `width`. which: (M,) int64 cap that a pixel may meet; empty: by the grid,
+    whose rows the caps are. directions: (3, K M) float64 in the panel frame; empty: of a pinhole, `to_panel`, (3, 3),
+    times (u - c_x, v - c_y, 1). lens: (2,) c_x, c_y. before: (F, 3) float64, distance along the normal and the indices
+    on both sides, of the faces up to the caps', which is the last. caps: (N, 6) float64 centre in the panel frame,
+    contact radius squared, depth of the sphere's centre, 1 / its radius, index. later: (F, 3) thickness before a face
+    and the indices on both sides. grid: see `whose`. to_image: (3, 3) from the panel frame. view: (4,) c_x, c_y,
+    distance of the last face, 1 / depth. clear: (M,) float64 what reaches each pixel through the bare panels.
     """
     rays = np.zeros(PLANES * ROOM, np.float64)
     count = U(side * side)
