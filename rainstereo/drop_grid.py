@@ -13,7 +13,8 @@ from .types import Array, Indices
 NOBODY = -1
 """The number of no drop."""
 BLOCK = 1 << 13  # drops that are sorted at a time
-CELLS = 256  # along each side, at most
+CELLS = 256  # along each side, at most; twice as many where drops lie `DEEP` on one another
+DEEP = 10.0
 ROUNDING = 1e-5  # of the reach: single precision must not lose a ray at the rim
 SLACK = 1e-3  # of a cell, that a ray may be beside it, for the same reason
 
@@ -41,7 +42,8 @@ class DropGrid:
         wide = reach + margin * top
         self.low = (centres - wide[:, None]).min(0)
         extent = (centres + wide[:, None]).max(0) - self.low
-        self.cell = max(float(np.median(wide)), float(extent.max()) / CELLS)
+        deep = 4 * wide @ wide > DEEP * extent.prod()  # smaller cells tell better which drops are hidden
+        self.cell = max(float(np.median(wide)), float(extent.max()) / CELLS) / (2 if deep else 1)
         self.size = np.maximum(np.ceil(extent / self.cell).astype(int), 1)
         self.slack = SLACK * self.cell + 1e-6 * float(np.abs([self.low, self.low + extent]).max())
         self.starts, self.candidates = self._sort(centres, reach, wide)
