@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, overload
 
 import numpy as np
@@ -42,13 +42,13 @@ class Caps(Sequence[SphericalCap]):
     @property
     def top(self) -> Array:
         """Heights of the apices, (N,) metres."""
-        _, _, radius, angle = self.table()
+        radius, angle = (column[self.rows] for column in self.columns[2:])
         return np.asarray(radius * np.tan(angle / 2))
 
     @property
     def reach(self) -> Array:
         """Contact radii, or the spheres' where these overhang, (N,) metres."""
-        _, _, radius, angle = self.table()
+        radius, angle = (column[self.rows] for column in self.columns[2:])
         return np.where(angle <= math.pi / 2, radius, radius / np.sin(angle))
 
     def __len__(self) -> int:
@@ -91,7 +91,7 @@ def joined(parts: Sequence[Sequence[Drop]]) -> Sequence[Drop]:
     same = [part for part in parts if isinstance(part, Caps) and part.columns is getattr(parts[0], "columns", None)]
     if len(same) < len(parts):
         return [drop for part in parts for drop in part]
-    return Caps(same[0].columns, same[0].place, np.concatenate([part.numbers for part in same]))
+    return same[0] if len(same) == 1 else replace(same[0], rows=np.concatenate([part.numbers for part in same]))
 
 
 def places_of(drops: Sequence[Drop]) -> set[tuple[int, str]]:
@@ -105,4 +105,6 @@ def numbers_of(drops: Sequence[Drop], name: str) -> Array:
     """What is given of each drop, (N, ...): its centre, reach or top."""
     if not isinstance(drops, Caps):
         return np.array([getattr(drop, name) for drop in drops])
-    return drops.table()[:2].T if name == "centre" else getattr(drops, name)
+    if name == "centre":
+        return np.stack([column[drops.rows] for column in drops.columns[:2]], -1)
+    return np.asarray(getattr(drops, name))

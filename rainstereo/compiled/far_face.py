@@ -31,13 +31,13 @@ def look(
 ) -> None:  # fmt: skip
     """Write where side x side rays of each pixel look, (K, M, 2) float32, and gain and opacity, (K, M) float32.
 
-    pixels: (M,) int64 numbers in rows of `width`. which: (M,) int64 cap that a pixel may meet; empty: by the grid.
-    directions: (3, K M) float64 in the panel frame; empty: of a pinhole, `to_panel`, (3, 3), times (u - c_x, v - c_y,
-    1). lens: (2,) c_x, c_y. before: (F, 3) float64, distance along the normal and the indices on both sides, of the
-    faces up to the caps', which is the last. caps: (N, 6) float64 centre in the panel frame, contact radius squared,
-    depth of the sphere's centre, 1 / its radius, index. later: (F, 3) thickness before a face and the indices on both
-    sides. grid: see `whose`. to_image: (3, 3) from the panel frame. view: (4,) c_x, c_y, distance of the last face,
-    1 / depth. clear: (M,) float64 what reaches each pixel through the bare panels.
+    pixels: (M,) int64 numbers in rows of `width`. which: (M,) int64 cap that a pixel may meet; empty: by the grid,
+    whose rows the caps are. directions: (3, K M) float64 in the panel frame; empty: of a pinhole, `to_panel`, (3, 3),
+    times (u - c_x, v - c_y, 1). lens: (2,) c_x, c_y. before: (F, 3) float64, distance along the normal and the indices
+    on both sides, of the faces up to the caps', which is the last. caps: (N, 6) float64 centre in the panel frame,
+    contact radius squared, depth of the sphere's centre, 1 / its radius, index. later: (F, 3) thickness before a face
+    and the indices on both sides. grid: see `whose`. to_image: (3, 3) from the panel frame. view: (4,) c_x, c_y,
+    distance of the last face, 1 / depth. clear: (M,) float64 what reaches each pixel through the bare panels.
     """
     rays = np.zeros(PLANES * ROOM, np.float64)
     count = U(side * side)
@@ -141,10 +141,10 @@ def take(caps: Any, cap: Any, rays: Any, ray: Any) -> None:
 def whose(rays: Any, ray: Any, face: Any, grid: Any) -> Any:
     """The cap that a ray at the face may meet, -1 for none: `DropGrid.whose`, and the slope that it is asked with.
 
-    grid: a `DropGrid`'s low, (2,) float32; cell, float32; size, (2,) int64; table, (4, N) float32; candidates, (L, C)
-    int64; and numbers, (N,) int64.
+    grid: a `DropGrid`'s low, (2,) float32; cell, float32; size, (2,) int64; table, (4, N) float32; starts, (C + 2,)
+    int64; and candidates, (P,) int32.
     """
-    low, side, cells, table, candidates, numbers = grid
+    low, side, cells, table, starts, candidates = grid
     x, y = np.float32(rays[X + ray]), np.float32(rays[Y + ray])
     u, v = (x - low[0]) / side, (y - low[1]) / side
     if not (u >= 0 and u < cells[0] and v >= 0 and v < cells[1]):
@@ -154,16 +154,14 @@ def whose(rays: Any, ray: Any, face: Any, grid: Any) -> Any:
     kz2 = min(max(kz2, np.float32(1 / (1 + STEEPEST * STEEPEST))), np.float32(1))
     slope = np.float32(math.sqrt(np.float32(1) / kz2 - np.float32(1)))
     owner, best = NOBODY, np.float32(np.inf)
-    for layer in range(len(candidates)):
-        row = candidates[layer, cell]
-        if row < 0:
-            break
+    for at in range(U(starts[cell]), U(starts[cell + 1])):
+        row = U(candidates[at])
         dx, dy, reach = x - table[0, row], y - table[1, row], table[2, row]
         square = dx * dx + dy * dy
         deep, near = square - reach * reach, (reach + slope * table[3, row]) * (np.float32(1) + ROUNDING)
         if deep < best and square < near * near:
             owner, best = np.int64(row), deep
-    return numbers[owner] if owner >= 0 else NOBODY
+    return owner
 
 
 @fused_part

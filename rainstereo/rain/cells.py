@@ -25,7 +25,7 @@ from .lookups import Lookups
 from .quadtree import UNIT
 
 SHIFT = UNIT.bit_length() - 1
-TOGETHER = 1 << 20  # taps whose rows are put in order at a time
+TOGETHER = 1 << 19  # taps whose rows are put in order at a time
 LARGEST, ANY = 127, 1 << 15  # that a tap weighs in one byte, in two
 LIGHT, FEWER = 0.5, 0.8
 """Share of `LARGEST` that taps weigh in the mean, and share of their number that pairs are, up to which these pay."""
@@ -75,24 +75,22 @@ class Arena:
 class Cells:
     """All cells of a frame, in parts that are found together.
 
-    tables: in whose order the M rows are counted. counts, pixels: (M,) of rows; starts: (M,), in its table, of a row's
-    first tap. clear: (M,) uint16 weights of what is below. roundings: (M,) int16, what is added to sums, in 1/`UNIT`.
+    tables: in whose order the M rows are counted. starts: (M,), in its table, of a row's first tap. clear: of tables,
+    (n,) uint16 weights of what is below. roundings: (M,) int16, what is added to sums, in 1/`UNIT`.
     places: (N,) uint32 of each texel in the row of those needed. order: (M,) rows, tile by tile, in each those of as
     many taps together. parts: where in the order parts begin, and its end.
     """
 
     tables: Sequence[Lookups]
-    counts: Any
-    pixels: Any
     starts: Any
-    clear: Any
+    clear: Sequence[Any]
     roundings: Any
     places: Any
     order: Any
     parts: list[int]
 
     @classmethod
-    def of(cls, tables: Sequence[Lookups], clear: Any, roundings: Any, places: Any, width: int) -> Cells:
+    def of(cls, tables: Sequence[Lookups], clear: Sequence[Any], roundings: Any, places: Any, width: int) -> Cells:
         """roundings: more by `BELOW`. width: of the frame."""
         tiles = np.concatenate([table.tiles(width) for table in tables])
         counts = np.concatenate([table.counts for table in tables])
@@ -103,7 +101,7 @@ class Cells:
         so_far = np.cumsum(counts[order], dtype=np.int64)
         begun = others[np.unique(so_far[others - 1] // TOGETHER, return_index=True)[1]]
         return cls(
-            tables, counts, pixels.view(np.uint32), starts.astype(np.int32), clear,
+            tables, starts.astype(np.int32), clear,
             (roundings - np.uint32(BELOW << SHIFT)).astype(np.int16), places, order.astype(np.int32),
             np.unique([0, *begun.tolist(), len(order)]).tolist(),
         )  # fmt: skip
@@ -116,7 +114,8 @@ class Cells:
     def _of_rows(self, rows: Any, arena: Arena) -> Iterator[Cell]:
         from rainstereo.compiled.cells import cut
 
-        counts, clear = self.counts[rows], self.clear[rows]
+        counts = self._gathered([table.counts for table in self.tables], rows)
+        pixels, clear = self._gathered([table.pixels for table in self.tables], rows), self._gathered(self.clear, rows)
         texels, weights = self._taps(rows, counts)
         every = int(self.places.max(initial=0)) // LANES + 1
         seen, number = np.zeros(every, dtype=np.uint32), np.zeros(every, dtype=np.uint16)
@@ -126,7 +125,20 @@ class Cells:
         of_taps = np.append(0, np.cumsum(counts, dtype=np.int64))[of_rows].tolist()
         for some, part, near in zip(pairwise(of_rows), pairwise(of_taps), pairwise(of_pieces), strict=True):
             own: Any = np.sort(pieces[slice(*near)])
-            yield self._cell(rows[slice(*some)], texels[slice(*part)], weights[slice(*part)], own, number, arena)
+            cell = slice(*some)
+            yield self._cell(
+                counts[cell], pixels[cell].view(np.uint32), clear[cell], self.roundings[rows[cell]],
+                texels[slice(*part)], weights[slice(*part)], own, number, arena,
+            )  # fmt: skip
+
+    def _gathered(self, columns: Sequence[Any], rows: Any) -> Any:
+        """What columns of the tables, (n,) each, hold of rows."""
+        found, begin = np.empty(len(rows), dtype=columns[0].dtype), 0
+        for column in columns:
+            some = np.flatnonzero((rows >= begin) & (rows < begin + len(column)))
+            found[some] = column[rows[some] - begin]
+            begin += len(column)
+        return found
 
     def _taps(self, rows: Any, counts: Any) -> tuple[Any, Any]:
         """Texels and weights of rows, one row after the other."""
@@ -149,29 +161,33 @@ class Cells:
         reorder(np.arange(len(rows)), starts, counts, *given, *found)
         return found[0], found[1]
 
-    def _cell(self, rows: Any, places: Any, weights: Any, pieces: Any, number: Any, arena: Arena) -> Cell:
+    @staticmethod
+    def _cell(
+        counts: Any, pixels: Any, clear: Any, roundings: Any, places: Any, weights: Any, pieces: Any, number: Any,
+        arena: Arena,
+    ) -> Cell:  # fmt: skip
         """number: of all pieces, to work in."""
         from rainstereo.compiled.cells import interleave
 
         number[pieces] = LANES * np.arange(len(pieces))
-        clear, largest = self.clear[rows], ANY
+        largest, most = ANY, _most(counts + (clear > 0))
         kind: Any = np.int16
-        counts, most = self.counts[rows], _most(self.counts[rows] + (clear > 0))
         some = np.abs(weights[::LANES], dtype=np.int32)  # enough to tell
         if some.sum() <= LIGHT * LARGEST * len(some):
             order, paired, *taps = _pairs(counts, places, weights, number, clear)
             fewer = _most(paired + _parts(clear[order]))
             if fewer.sum() <= FEWER * most.sum():
-                rows, clear, largest, kind = rows[order], clear[order], LARGEST, np.int8
+                pixels, clear, roundings = pixels[order], clear[order], roundings[order]
+                largest, kind = LARGEST, np.int8
                 counts, (places, weights), number, most = paired, taps, EIGHTS, fewer
-        pixels, soft = self.pixels[rows], clear > 0
+        soft = clear > 0
         size = LANES * int(most.sum())
         made = arena.take(size), arena.take(size).view(np.int16)
         interleave(counts, places, weights, number, clear, LANES * len(pieces), largest, most, *made)
-        rest = (0, -len(rows) % LANES)
+        rest = (0, -len(pixels) % LANES)
         return Cell(
             pieces, pixels[soft], np.pad(pixels, rest, mode="edge"), most.astype(np.uint32), made[0],
-            made[1].view(kind), np.pad(self.roundings[rows], rest, mode="edge"),
+            made[1].view(kind), np.pad(roundings, rest, mode="edge"),
         )  # fmt: skip
 
 

@@ -49,7 +49,7 @@ class Drops:
         for name in COLUMNS:
             given = np.array(getattr(self, name), dtype=np.int64 if name == "id" else np.float64)
             if given.ndim == 0 and name == "birth":
-                given = np.full(count, given)
+                given = np.broadcast_to(given, count)
             if given.shape != (count,) or not np.isfinite(given).all():
                 raise ValueError(
                     f"the column {name} of {count} drops has shape {given.shape}, {int(np.isfinite(given).sum())} "

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
 
 from rainstereo import compiled
 from rainstereo.camera import Camera
-from rainstereo.caps import Caps, numbers_of, places_of
+from rainstereo.caps import Caps, numbers_of, places_of, some_of
 from rainstereo.chamber import Chamber
 from rainstereo.drop_grid import DropGrid
 from rainstereo.drop_stack import STEEPEST, DropStack
@@ -26,6 +27,10 @@ from rainstereo.types import Array, Image, Indices
 from .samples import Samples
 
 MOST = 32  # rays along a pixel's side
+NO_GRID = (
+    np.zeros(2, np.float32), np.float32(1), np.zeros(2, np.int64), np.zeros((4, 0), np.float32), np.zeros(0, np.int64),
+    np.zeros(0, np.int32),
+)  # fmt: skip
 STEEPER = 1.5  # than rays through the middles of pixels are those that a grid is made for
 
 
@@ -40,7 +45,8 @@ def are_far_caps(drops: Sequence[Drop]) -> bool:
 class FarCaps:
     """Caps on one far face, ready for the loop.
 
-    faces: those up to the caps', and those behind it, as `compiled.far_face.look` takes them. caps: (N, 6) float64.
+    faces: those up to the caps', and those behind it, as `compiled.far_face.look` takes them. grids: of those that rays
+    can meet, the last one that was needed, and their `_table`.
     """
 
     camera: Camera
@@ -50,8 +56,7 @@ class FarCaps:
     faces: tuple[Array, Array]
     end: float
     origin: Array
-    caps: Array
-    grids: list[DropGrid]
+    grids: list[tuple[DropGrid, Array]]
 
     @classmethod
     def of(cls, drops: Sequence[Drop], camera: Camera, chamber: Chamber, depth: float) -> FarCaps | None:
@@ -70,10 +75,8 @@ class FarCaps:
             [(b.z - a.z, b.n1, b.n2) for a, b in zip(stack.faces[own:], stack.faces[own + 1 :], strict=False)]
         )
         face = stack.faces[own]
-        columns = CapColumns.of(cast(Sequence[SphericalCap], drops), face.origin)
-        caps = np.stack([getattr(columns, name) for name in columns.__dataclass_fields__], -1)
         faces = before, later.reshape(-1, 3)
-        return cls(camera, depth, drops, stack.frame.R_panel_cam, faces, stack.end, face.origin, caps, [])
+        return cls(camera, depth, drops, stack.frame.R_panel_cam, faces, stack.end, face.origin, [])
 
     def look(self, pixels: Indices, which: Indices | None, side: int, clear: Array) -> Samples:
         """side x side rays of pixels, (M,) numbers. which: (M,) cap of each; None: find out. clear: (M,), see
@@ -88,10 +91,11 @@ class FarCaps:
         directions = np.zeros((3, 0)) if pinhole else self._directions(pixels, side)
         source: Image = np.empty((side * side, count, 2), dtype=np.float32)
         gain, opacity = np.empty_like(source[..., 0]), np.empty_like(source[..., 0])
+        caps, grid = (self._every, NO_GRID) if which is not None else self._grid(pixels)
         look(
             pixels.astype(np.int64, copy=False), np.zeros(0, np.int64) if which is None else which.astype(np.int64),
-            width, side, directions, to_panel, np.array([cx, cy]), self.faces[0], self.caps, self.faces[1],
-            self._grid(pixels if which is None else pixels[:0]), np.ascontiguousarray(np.diag([fx, fy, 1]) @ self.R.T),
+            width, side, directions, to_panel, np.array([cx, cy]), self.faces[0], caps, self.faces[1],
+            grid, np.ascontiguousarray(np.diag([fx, fy, 1]) @ self.R.T),
             np.array([cx, cy, self.end, 1 / self.depth]), clear.astype(np.float64), source, gain, opacity,
         )  # fmt: skip
         if not pinhole:
@@ -112,17 +116,24 @@ class FarCaps:
         columns = self.camera.unproject_columns(u.ravel().astype(np.float64), v.ravel().astype(np.float64))
         return np.ascontiguousarray(self.R @ np.stack(np.broadcast_arrays(*columns)))
 
-    def _grid(self, pixels: Indices) -> tuple[Any, ...]:
-        """Which caps are where on the face, for rays of these pixels."""
-        if not len(pixels):
-            none = np.zeros((4, 0), dtype=np.float32), np.zeros((0, 0), dtype=np.int64), np.zeros(0, dtype=np.int64)
-            return np.zeros(2, dtype=np.float32), np.float32(1), np.zeros(2, dtype=np.int64), *none
+    @cached_property
+    def _every(self) -> Array:
+        return self._table(self.drops)
+
+    def _table(self, drops: Sequence[Drop]) -> Array:
+        """(N, 6) float64, as the loop takes caps."""
+        columns = CapColumns.of(cast(Sequence[SphericalCap], drops), self.origin)
+        return np.stack([getattr(columns, name) for name in columns.__dataclass_fields__], -1)
+
+    def _grid(self, pixels: Indices) -> tuple[Array, tuple[Any, ...]]:
+        """The caps that rays of these pixels can meet, and which of them are where on the face."""
         kx, ky, kz = self._directions(pixels, 1)
         square = (kx * kx + ky * ky) / (kz * kz)  # of the slope in the air before the panels, and so behind them
         steepest = min(float(np.sqrt(np.nanmax(square, initial=0))), STEEPEST)
-        if not self.grids or self.grids[0].margin < steepest:
+        if not self.grids or self.grids[0][0].margin < steepest:
             margin = min(STEEPER * steepest, STEEPEST)
-            self.grids[:] = [DropGrid(range(len(self.drops)), self.drops, self.origin, margin)]
-        grid = self.grids[0]
-        low, table = grid.low.astype(np.float32), np.ascontiguousarray(grid.table, dtype=np.float32)
-        return low, np.float32(grid.cell), grid.size.astype(np.int64), table, grid.candidates, grid.numbers
+            grid = DropGrid(range(len(self.drops)), self.drops, self.origin, margin)
+            self.grids[:] = [(grid, self._table(some_of(self.drops, grid.numbers[:-1])))]
+        grid, caps = self.grids[0]
+        low, size = grid.low.astype(np.float32), grid.size.astype(np.int64)
+        return caps, (low, np.float32(grid.cell), size, grid.table, grid.starts, grid.candidates)

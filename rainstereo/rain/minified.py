@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -123,6 +124,7 @@ class Minifier:
     depth: of the scene, metres. tolerance: gray levels RMS. source_size, shift: of the image that holds the scene,
     (width, height), and the place of the camera's image in it. border: "mirror" or "edge".
     lasting: whether it is worth much time to find few texels. dearer: times that these must be worth more than usual.
+    clear: see `_clear_map`.
     """
 
     camera: Camera
@@ -134,23 +136,25 @@ class Minifier:
     border: str = "mirror"
     lasting: bool = False
     dearer: float = 1.0
+    clear: Any = None
 
     def __post_init__(self) -> None:
-        self.clear = _clear_map(self.camera, self.chamber)
+        if self.clear is None:
+            self.clear = _clear_map(self.camera, self.chamber)
 
     def lookups(self, batches: Sequence[Batch]) -> list[Lookups]:
         """What every pixel of the batches that a drop covers looks at."""
+        from .compile_ahead import MANY, compile_ahead  # which needs `paste`
+
+        if sum(len(batch.pixels) for batch in batches) > MANY:
+            compile_ahead("lasting" if self.lasting else "default")
+            give_back()  # what it took to find the batches
         if self.dearer == 1 and (dearer := self._dearer(batches)) > 1:
             return replace(self, dearer=dearer).lookups(batches)
         tables: list[Lookups] = []
         small: list[Lookups] = []
         wide: list[Lookups] = []
         size = every = 0
-        from .compile_ahead import MANY, compile_ahead  # which needs `paste`
-
-        if sum(len(batch.pixels) for batch in batches) > MANY:
-            compile_ahead("lasting" if self.lasting else "default")
-            give_back()  # what it took to find the batches
         for table in self._one_by_one(batches):
             every += len(table.texels)
             if size + table.size > self._joined:  # before the next ones come: the memory of these serves them
@@ -173,8 +177,13 @@ class Minifier:
         """Whether the tree's texels of a frame would be too many for its time, and there are loops to find fewer."""
         room = CROWDED * self.camera.width * self.camera.height
         suits = self.tolerance >= STRICT and rays_along(self.tolerance) == rays_along(STRICT)
-        if not (suits and compiled.available()) or sum(len(batch.pixels) for batch in batches) <= room:
+        count = sum(len(batch.pixels) for batch in batches)
+        if not (suits and compiled.available()) or count <= room:
             return False
+        from .compile_ahead import MANY, compile_ahead  # which needs `paste`
+
+        if count > MANY:
+            compile_ahead("default")  # whether it is crowded or not, the same rays are traced
         for part in (part for batch in batches for part in batch.parts()):
             room -= np.count_nonzero(self._kinds(part) == LIT)
             part.let_go()
@@ -246,7 +255,7 @@ class Minifier:
         edges, outlines = (np.split(each, ends) for each in found)
         for batch, kind, edge, outline in zip(batches, kinds, edges, outlines, strict=True):
             for some, more in ((~outline & (edge | (kind == LIT)), 1), (outline, OUTLINE)):
-                rows = np.flatnonzero(some)
+                rows = np.flatnonzero(some).astype(np.int32)
                 for first in range(0, len(rows), CHUNK // more**2):
                     yield partial(self._of_rows, batch, rows[first : first + CHUNK // more**2], more * side)
             dark = np.flatnonzero(~edge & (kind == DARK))

@@ -23,6 +23,7 @@ SEEN, AROUND, HEIGHTS = 5, 16, 2
 """Points of a circle whose image is found, and those, of a polygon around it, that are interpolated between them: along
 the image of a small circle, with two frequencies, what is left out is of the third order in its size."""
 BLOCK = 4096  # drops whose circles are found at a time
+ASKED = 1024  # whose neighbours are
 ASIDE = 1.5  # times as far as a drop's top appears from its foot; an image may stretch to one side
 MARGIN = 2.5
 """Pixels around a drop that are its own too: a ring without any of it, so that two groups share no pixel."""
@@ -186,16 +187,24 @@ class Outlines:
 def _chains(x: Array, y: Array, radius: Array) -> Indices:
     """Label, (N,), of circles: those of a chain of which each meets the next carry the same.
 
-    Block by block, each joined to the chains so far: where thousands overlap, all their pairs would fill the memory.
+    Neighbours of some at a time, each joined to the chains so far: where thousands overlap, all their pairs would fill
+    the memory. Of those that are by then in one large chain, always the same, nobody's are looked for: whom they meet
+    is in it too, or is asked for.
     """
     count = len(x)
     every = np.arange(count)
-    head, labels = every, every
-    for first in range(0, count, BLOCK):
-        some = None if count <= BLOCK else (every >= first) & (every < first + BLOCK)
-        one, other = touching(x, y, radius, some)
-        labels = clusters(count, np.concatenate([one, every]), np.concatenate([other, head]))
+    head, labels, large = every, every, -1
+    left: Mask = np.ones(count, dtype=np.bool_)
+    while (rest := np.flatnonzero(left)).size:
+        some = np.zeros(count, dtype=np.bool_)
+        some[rest[:: -(-len(rest) // ASKED)]] = True
+        one, other = (head[each] for each in touching(x, y, radius, some))
+        apart = one != other
+        labels = clusters(count, np.concatenate([one[apart], every]), np.concatenate([other[apart], head]))
         head = np.unique(labels, return_index=True)[1][labels]
+        if large < 0:
+            large = int(head[np.bincount(head).argmax()])
+        left &= ~some & (head != head[large])
     return labels
 
 

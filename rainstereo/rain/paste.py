@@ -198,13 +198,13 @@ class Paste:
 
     @cached_property
     def _kept(self) -> list[Cell]:
-        clear, roundings = np.concatenate(self._clear), np.concatenate(self._roundings)
-        every = Cells.of(self.tables, clear, roundings, self._places, self.width)
-        give_back()  # what putting rows in order took, before memory for cells is taken
-        cells = list(every)
+        roundings, places = np.concatenate(self._roundings), self._places
         for name in ("_places", "_roundings"):  # which only other frames need: those of other types than bytes
             self.__dict__.pop(name, None)
-        return cells
+        every = Cells.of(self.tables, self._clear, roundings, places, self.width)
+        del roundings
+        give_back()  # what putting rows in order took, before memory for cells is taken
+        return list(every)
 
     @cached_property
     def _places(self) -> Any:

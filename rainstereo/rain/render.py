@@ -364,8 +364,9 @@ def _batch(groups: Sequence[Group], numbers: Indices) -> Batch:
         return Batch(drops, pixels, numbers[which], which)
     of_circle = np.repeat(numbers, [len(group.outlines.x) for group in groups])
     pixels, group = outlines.united(of_circle)  # circles of different groups share none
-    if len(places_of(drops)) > 1:  # what is seen through another may be anywhere
-        return Batch(drops, pixels, group)
+    pixels, group = pixels.astype(np.int32), group.astype(np.int32)
+    if len(places_of(drops)) > 1 or (available() and are_far_caps(drops)):
+        return Batch(drops, pixels, group)  # what is seen through another may be anywhere; the loop finds out by itself
     return Batch(drops, pixels, group, None, outlines.y - outlines.radius, outlines.y + outlines.radius)
 
 

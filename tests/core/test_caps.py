@@ -57,24 +57,31 @@ def test_rows_are_joined_as_columns_if_they_are_of_one_table():
     assert mixed == [drops[0], drops[1], other[0], other[3], other[4]]
 
 
-@pytest.mark.parametrize("block", [7, 1 << 15])
-def test_a_grid_of_many_drops(block, monkeypatch):
-    """Cells hold the drops that reach them, in their order, whether sorted at once or some at a time."""
+@pytest.mark.parametrize("block", [7, 1 << 13])
+@pytest.mark.parametrize("count", [60, 3000])
+@pytest.mark.parametrize("face", ["near", "far"])
+def test_a_grid_of_many_drops(block, count, face, monkeypatch):
+    """Whether sorted at once or some at a time, cells hold all drops that can win there, however many they hide."""
     monkeypatch.setattr("rainstereo.drop_grid.BLOCK", block)
-    caps, margin = table(300).lazily(), 1.0
-    grid = DropGrid(range(300), caps, np.zeros(3), margin)
-    x, y, reach, top = grid.table
-    wide = reach + margin * top
-    for cell in range(int(grid.size.prod())):
-        row, column = divmod(cell, int(grid.size[0]))
-        near = np.ones(300, dtype=bool)
-        for at, low, number in ((x, grid.low[0], column), (y, grid.low[1], row)):
-            last = grid.size[int(at is y)] - 1
-            first, end = (np.floor((at + sign * wide - low) / grid.cell).clip(0, last) for sign in (-1, 1))
-            near &= (first <= number) & (end >= number)
-        found = grid.candidates[:, cell]
-        np.testing.assert_array_equal(found[found >= 0], np.flatnonzero(near))
-        assert (np.diff((found >= 0).astype(int)) <= 0).all()
+    caps, margin = table(count, face=face).lazily(), 1.0
+    grid = DropGrid(range(count), caps, np.zeros(3), margin)
+    x, y, radius, angle = caps.table()
+    reach, top = np.asarray(caps.reach, np.float32), np.asarray(radius * np.tan(angle / 2), np.float32)
+    order = np.lexsort((caps.reach, x, y, -caps.top))
+    rng = np.random.default_rng(3)
+    u, v = (rng.uniform(each.min() - 1e-3, each.max() + 1e-3, 5000).astype(np.float32) for each in (x, y))
+    slope = rng.uniform(0, margin, len(u)).astype(np.float32)
+    best, owner = np.full(len(u), np.inf, np.float32), np.full(len(u), -1)
+    for i in order:
+        dx, dy = u - np.float32(x[i]), v - np.float32(y[i])
+        square, near = dx * dx + dy * dy, (reach[i] + slope * top[i]) * np.float32(1 + 1e-5)
+        deep = square - reach[i] * reach[i]
+        wins = (deep < best) & (square < near * near)
+        best[wins], owner[wins] = deep[wins], i
+    np.testing.assert_array_equal(grid.whose(u, v, slope), owner)
+    kept = grid.numbers[:-1]
+    assert set(np.unique(owner[owner >= 0])) <= set(kept.tolist())
+    assert len(kept) == count if count == 60 else len(kept) < 0.9 * count
 
 
 @pytest.mark.parametrize("lasting", [True, False])

@@ -236,7 +236,8 @@ def test_pixels_of_circles_that_overlap(count, monkeypatch):
         if radius[i] > 0:
             expected[(x - circles.x[i]) ** 2 + (y - circles.y[i]) ** 2 <= radius[i] ** 2] = labels[i]
     for block in (outlines.BLOCK, 13):
-        monkeypatch.setattr(outlines, "BLOCK", block)
+        for name in ("BLOCK", "ASKED"):
+            monkeypatch.setattr(outlines, name, block)
         again = np.zeros(count, np.intp)
         for number, rows in enumerate(circles.groups()):
             again[rows] = 3 * number + 5
