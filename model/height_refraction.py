@@ -49,7 +49,7 @@ class HeightCells:
         return self._interpolate(x, y)[:3]
 
     def _interpolate(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Height and slopes, 0 outside the grid; the cell, and whether it is inside."""
+        """Height and slopes, see `HeightMap._interpolate`; the cell, and whether it is inside."""
         rows, columns = self.drop.heights.shape
         u, v = x / self.drop.spacing + (columns - 1) / 2, y / self.drop.spacing + (rows - 1) / 2
         inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
@@ -66,6 +66,7 @@ class HeightCells:
         along_v = r1 + v * (2 * r2 + v * (3 * r3))
         t0, t1, t2, t3 = tilt.unbind(-1)
         along_u = t0 + v * (t1 + v * (t2 + v * t3))
+        height = torch.where(self.wet[cell], height, height.clamp(max=0))
         height, sx, sy = (torch.where(inside, a, 0.0) for a in (height * self.drop.spacing, along_u, along_v))
         return height, sx, sy, cell, inside
 

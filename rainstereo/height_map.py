@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 
 from . import compiled
@@ -17,8 +18,6 @@ from .types import Array, Indices, Mask
 STEEPEST = math.radians(89.0)
 INTERPOLATIONS = ("bicubic", "bilinear")
 MOST_STEPS = 100
-MANY = 64
-"""Places at a time from which a loop in machine code, which must be loaded first, is asked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +169,8 @@ class HeightMap(Drop):
 
     def let_go(self) -> None:
         """Give up what rays need; whoever traces the drop again makes it anew."""
-        self.__dict__.pop("_nodes", None)
+        for name in ("_nodes", "_dry"):
+            self.__dict__.pop(name, None)
 
     def _made_nodes(self) -> Array:
         heights = self.heights / self.spacing
@@ -208,12 +208,15 @@ class HeightMap(Drop):
         return np.ascontiguousarray(found.reshape(down * across, 4, 4))
 
     def _interpolate(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Height, also below the face, and slopes; 0 height and slopes outside the grid."""
-        if len(x) >= MANY and self.interpolation == "bicubic" and compiled.available():
+        """Height, also below the face, and slopes; 0 height and slopes outside the grid.
+
+        In cells without a wet node, where a spline may swing up beside a cliff, no height is above the face.
+        """
+        if self.interpolation == "bicubic" and compiled.pays(len(x)):
             from rainstereo.compiled.height_map import interpolate
 
             found = np.empty((3, len(x)), dtype=x.dtype)
-            interpolate(x, y, x.dtype.type(self.spacing), self._units[0], self._nodes, found)
+            interpolate(x, y, x.dtype.type(self.spacing), self._units[0], self._nodes, self._dry, found)
             return found[0], found[1], found[2]
         u, v = x / self.spacing, y / self.spacing
         rows, columns = self.heights.shape
@@ -225,6 +228,7 @@ class HeightMap(Drop):
             u, v = u[inside], v[inside]
         i, j = np.minimum(v.astype(np.intp), rows - 2), np.minimum(u.astype(np.intp), columns - 2)
         values = self._sums(u - j, v - i, i * self._nodes.shape[1] + j)
+        np.minimum(values[0], 0, out=values[0], where=~self._wet_cells[i, j])
         if everywhere:
             height, sx, sy = (value.astype(x.dtype, copy=False) for value in values)
             return height, sx, sy
@@ -267,9 +271,18 @@ class HeightMap(Drop):
 
     def rays(self, x: Array, y: Array, ux: Array, uy: Array) -> HeightRays | None:
         """Loops in machine code for many rays."""
-        if len(x) < MANY or self.interpolation != "bicubic" or not compiled.available():
+        if self.interpolation != "bicubic" or not compiled.pays(len(x)):
             return None
-        return HeightRays(x.dtype.type(self.spacing), self._units[0], self._nodes, x, y, ux, uy)
+        return HeightRays(
+            x.dtype.type(self.spacing), self._units[0], self._nodes, self._dry, self.steepest, x, y, ux, uy
+        )
+
+    @cached_property
+    def _dry(self) -> Any:
+        """(H - 1, W - 1) uint8: 0 for wet cells; else 1, and as many more as there are at least to any wet one."""
+        away = cv2.distanceTransform((~self._wet_cells).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        away = np.clip(away - 1.5, 0, 254) + 1  # from middle to middle
+        return np.where(self._wet_cells, 0, away).astype(np.uint8)
 
     def level(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Array, Array]:
         """Height of the surface, continued below the face, minus z; and its derivatives."""

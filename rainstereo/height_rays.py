@@ -14,12 +14,14 @@ from .types import Array, Mask
 class HeightRays:
     """Rays, (N,) each, through x, y of the face with slopes ux, uy. nodes, metres: see `compiled.height_map`.
 
-    spacing: metres, of the rays' type.
+    spacing: metres, of the rays' type. dry, steepest: see `HeightMap`.
     """
 
     spacing: Any
     metres: float
     nodes: Array
+    dry: Any
+    steepest: float
     x: Array
     y: Array
     ux: Array
@@ -40,11 +42,11 @@ class HeightRays:
         return under
 
     def deepest(self, heights: Array, golden: float, refinements: int) -> tuple[Array, Array]:
-        """Where each is deepest in the water, and how deep."""
+        """Where each is deepest in the water, and how deep; what passes by is not looked at closely."""
         from .compiled.height_map import deepest
 
         height, best = np.zeros_like(self.x), np.full_like(self.x, -np.inf)
-        deepest(*self._with(heights, self._exactly(golden), refinements, height, best))
+        deepest(*self._with(heights, self.steepest, self._exactly(golden), refinements, height, best))
         return height, best
 
     def meet(self, low: Array, high: Array, tolerance: float, iterations: int) -> Array:
@@ -59,7 +61,7 @@ class HeightRays:
     def _with(self, *others: Any) -> list[Any]:
         """What the loops take: rays, map, their own, and room."""
         rays = (np.ascontiguousarray(column, self.x.dtype) for column in (self.x, self.y, self.ux, self.uy))
-        return [*rays, self.spacing, self.metres, self.nodes, *others, np.zeros(3, self.x.dtype)]
+        return [*rays, self.spacing, self.metres, self.nodes, self.dry, *others, np.zeros(3, self.x.dtype)]
 
     def _exactly(self, number: float) -> Any:
         """A number of the rays' type."""

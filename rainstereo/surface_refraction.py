@@ -174,7 +174,10 @@ def _heights(drop: Drop, dtype: Any) -> Array:
 
 
 def _deepest(drop: Drop, x: Array, y: Array, ux: Array, uy: Array) -> tuple[Array, Array]:
-    """Height at which the ray is deepest in the water, and its level there: by samples, then golden section."""
+    """Height at which the ray is deepest in the water, and its level there: by samples, then golden section.
+
+    For one that passes by, any level that is not above 0.
+    """
 
     def level(t: Array) -> Array:
         return drop.level(x + t * ux, y + t * uy, t)[0]

@@ -6,8 +6,11 @@ folder imports numba; others ask `available()` first, then import the loop that 
 
 from __future__ import annotations
 
+import sys
 from functools import cache
 from importlib import import_module
+
+MANY = 64
 
 
 @cache
@@ -18,3 +21,9 @@ def available() -> bool:
     except ImportError:
         return False
     return True
+
+
+def pays(count: int) -> bool:
+    """Whether to take a loop for so many numbers that numpy has in a moment: for few, only if numba is loaded, which
+    takes half a second."""
+    return (count >= MANY or "numba" in sys.modules) and available()

@@ -87,9 +87,9 @@ def _meet_bodies() -> None:
     from rainstereo.compiled.height_map import interpolate
 
     one: Any = np.zeros(1, dtype=np.float32)
-    nodes = np.zeros((6, 6))
-    rays = HeightRays(np.float32(1), 1.0, nodes, one, one, one, one)
-    interpolate(one, one, np.float32(1), 1.0, nodes, np.zeros((3, 1), dtype=np.float32))
+    nodes, dry = np.zeros((6, 6)), np.zeros((3, 3), dtype=np.uint8)
+    rays = HeightRays(np.float32(1), 1.0, nodes, dry, 1.0, one, one, one, one)
+    interpolate(one, one, np.float32(1), 1.0, nodes, dry, np.zeros((3, 1), dtype=np.float32))
     rays.first_change(one, True, one, one)
     rays.rises_above(one, one, 1.0)
     rays.deepest(one, 0.5, 1)
