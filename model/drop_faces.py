@@ -82,20 +82,23 @@ class DropFace:
         if not face.drops:
             return cls(face)
         groups: list[CapGroup | HeightGroup] = []
+        maps: dict[int, HeightCells] = {}
         caps = {i: drop for i, drop in face.drops.items() if isinstance(drop, SphericalCap)}
         if caps:
             table = CapTable.of([list(caps.values())], device=device, dtype=torch.float64)
             groups.append(CapGroup.of(table, face, _rows(list(caps), total, device)))
         for i, drop in face.drops.items():
             if i not in caps:
-                cells = HeightCells.of(_height_map(drop), dtype, device)
+                maps[i] = cells = HeightCells.of(_height_map(drop), dtype, device)
                 x, y = (face.origin[:2] + np.asarray(drop.centre)).tolist()
                 groups.append(HeightGroup(_rows([i], total, device), cells, x, y))
         everyone = face.drops.values()
         centres = np.array([face.origin[:2] + np.asarray(drop.centre) for drop in everyone])
         sizes = np.array([(drop.reach, drop.top) for drop in everyone])
         columns = (centres, *sizes.T, np.array(list(face.drops)))
-        return cls(face, groups, DropOwners(*(torch.from_numpy(c[None].copy()).to(device) for c in columns)))
+        bodies = {list(face.drops).index(i): cells for i, cells in maps.items()}
+        places, reach, top, numbers = (torch.from_numpy(c[None].copy()).to(device) for c in columns)
+        return cls(face, groups, DropOwners(places, reach, top, numbers, bodies))
 
     @classmethod
     def of_table(cls, face: Face, table: CapTable) -> DropFace:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from rainstereo.drop_grid import NOBODY
 from rainstereo.drop_stack import STEEPEST
 from rainstereo.model import fresnel
+from rainstereo.model.height_refraction import HeightCells
 from rainstereo.model.ray_tensors import Rays
 
 PAIRS, PAIRS_ELSEWHERE = 1 << 18, 1 << 24
@@ -24,14 +26,15 @@ class DropOwners:
     A ray belongs to the drop in whose circle (of radius `reach`) its point of the face lies deepest: the one of
     smallest d^2 - reach^2, d the distance from the centre. Beside all circles it belongs, in the same sense, to one
     whose side it can meet at its own slope (`DropGrid` goes by the steepest ray of a block, so that there a ray
-    between drops may miss the one it meets). The order of the drops does not matter, unless two stand on the very same
-    circle: then it may belong to either.
+    between drops may miss the one it meets). Bodies do not fill their circles, see `DropGrid`. The order of the
+    drops does not matter, unless two stand on the very same circle: then it may belong to either.
     """
 
     centres: Tensor  # (B, D, 2)
     reach: Tensor  # (B, D); 0: no drop
     top: Tensor  # (B, D)
     numbers: Tensor  # (B, D), by which the drops are known
+    bodies: Mapping[int, HeightCells] = field(default_factory=dict)  # by column, of the only image
 
     def whose(self, images: slice, rays: Rays, n1: float) -> Tensor:
         """Number of the drop, (N,), that each ray on the face's plane may meet; `NOBODY` if none.
@@ -57,6 +60,10 @@ class DropOwners:
             square = (x[:, some] - across).square_().add_((y[:, some] - down).square_())
             can_meet = square < torch.addcmul(reach, slopes[:, some], top).square_()
             outside = torch.where(can_meet, square - reach * reach, math.inf)
+            for column, cells in self.bodies.items():
+                away = cells.beside(x[0, some, 0] - across[0, 0, column], y[0, some, 0] - down[0, 0, column])
+                beside = (away > 0) & can_meet[0, :, column]
+                outside[0, beside, column] = (away * (away + 2 * reach[0, 0, column]))[beside]
             least, owner = outside.min(-1)
             owners[:, some] = torch.where(least < math.inf, numbers.gather(1, owner), NOBODY)
         return owners.reshape(-1)

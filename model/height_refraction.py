@@ -26,14 +26,13 @@ class HeightCells:
 
     drop: HeightMap
     cells: Tensor  # (cells, 4, 4) in units of the spacing
-    wet: Tensor  # (cells,) bool: where a node at a corner is wet
+    dry: Tensor  # (cells,) of the type of `cells`, see `HeightMap._dry`
 
     @classmethod
     def of(cls, drop: HeightMap, dtype: torch.dtype, device: torch.device) -> HeightCells:
         """The cells of a height map."""
         cells = torch.from_numpy(drop.polynomials())
-        wet = torch.from_numpy(drop._wet_cells.reshape(-1))
-        return cls(drop, cells.to(device, dtype), wet.to(device))
+        return cls(drop, cells.to(device, dtype), torch.from_numpy(drop._dry.reshape(-1)).to(device, dtype))
 
     def level(self, x: Tensor, y: Tensor, z: Tensor | float) -> Tensor:
         """Height of the surface, continued below the face, minus z: metres, positive in the water."""
@@ -42,7 +41,15 @@ class HeightCells:
     def covers(self, x: Tensor, y: Tensor) -> Tensor:
         """Where points of the face, (N,) each, are wetted."""
         height, _, _, cell, inside = self._interpolate(x, y)
-        return inside & self.wet[cell] & (height > 0)
+        return inside & (self.dry[cell] == 0) & (height > 0)
+
+    def beside(self, x: Tensor, y: Tensor) -> Tensor:
+        """`HeightMap.beside`."""
+        rows, columns = (n - 1 for n in self.drop.heights.shape)
+        i = (y / self.drop.spacing + 0.5 * rows).clamp(0, rows - 1).long()
+        j = (x / self.drop.spacing + 0.5 * columns).clamp(0, columns - 1).long()
+        away = (self.dry[i * columns + j] - 1).clamp(min=1e-3) * self.drop.spacing
+        return torch.where(self.covers(x, y), 0.0, away)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Height and its derivatives along x and y, (N,) each."""
@@ -66,7 +73,7 @@ class HeightCells:
         along_v = r1 + v * (2 * r2 + v * (3 * r3))
         t0, t1, t2, t3 = tilt.unbind(-1)
         along_u = t0 + v * (t1 + v * (t2 + v * t3))
-        height = torch.where(self.wet[cell], height, height.clamp(max=0))
+        height = torch.where(self.dry[cell] == 0, height, height.clamp(max=0))
         height, sx, sy = (torch.where(inside, a, 0.0) for a in (height * self.drop.spacing, along_u, along_v))
         return height, sx, sy, cell, inside
 

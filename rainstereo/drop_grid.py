@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from .caps import numbers_of
+from .caps import Caps, numbers_of
 from .droplet import Drop
-from .types import Array, Indices
+from .types import Array, Indices, Mask
 
 NOBODY = -1
 """The number of no drop."""
@@ -26,7 +26,8 @@ class DropGrid:
     smallest d^2 - reach^2, d the distance from the centre. So circles that overlap part along their common chord, and
     the order of the drops does not matter (of two on the very same circle, the taller one counts). Beside all circles
     it belongs to the one it is closest to, in the same sense, of those that it can meet: that stand no farther away
-    than it moves along the face over their height.
+    than it moves along the face over their height. Where a drop does not fill its circle (`Drop.beside`) a point in
+    there is as far from it as it is from what is wet, so that others may stand in its bays.
 
     Where drops hide one another, few can win: a cell has those alone, and a drop that no cell has is left out.
 
@@ -46,22 +47,30 @@ class DropGrid:
         self.cell = max(float(np.median(wide)), float(extent.max()) / CELLS) / (2 if deep else 1)
         self.size = np.maximum(np.ceil(extent / self.cell).astype(int), 1)
         self.slack = SLACK * self.cell + 1e-6 * float(np.abs([self.low, self.low + extent]).max())
-        self.starts, self.candidates = self._sort(centres, reach, wide)
+        some = [] if isinstance(drops, Caps) else [drops[i] for i in first]
+        bodies = {row: drop for row, drop in enumerate(some) if not drop.fills_circle}
+        hides = np.ones(len(numbers), dtype=np.bool_)
+        hides[list(bodies)] = False
+        self.starts, self.candidates = self._sort(centres, reach, wide, hides)
         wins = np.zeros(len(numbers), dtype=np.bool_)
         wins[self.candidates] = True
-        self.candidates = (np.cumsum(wins, dtype=np.int32) - np.int32(1))[self.candidates]
+        place = np.cumsum(wins, dtype=np.int32) - np.int32(1)
+        self.candidates = place[self.candidates]
+        self.bodies = {int(place[row]): drop for row, drop in bodies.items() if wins[row]}
         self.numbers = np.append(numbers[wins], np.int32(NOBODY))
         # single precision will do: whether a ray then meets its drop is decided elsewhere, in full
         self.table = np.stack([each[wins] for each in (*centres.T, reach, top)], dtype=np.float32, casting="same_kind")
 
-    def _sort(self, centres: Array, reach: Array, wide: Array) -> tuple[Indices, Indices]:
+    def _sort(self, centres: Array, reach: Array, wide: Array, hides: Mask) -> tuple[Indices, Indices]:
         """Rows of the drops that can win in each cell, cell by cell, and where those of each cell start, (cells + 2,);
-        the last cell, which has none, is outside everything."""
+        the last cell, which has none, is outside everything. hides: (N,) whether a drop fills its circle."""
         cells = int(self.size.prod())
         best = np.full(cells, np.inf)
         for cell, row in self._reached(centres, wide):
             far = np.hypot(*(np.abs(at) + (0.5 * self.cell + self.slack) for at in self._away(cell, centres[row])))
-            whole = far < reach[row]  # then any ray in the cell lies in the drop's circle, and so deep at least
+            whole = (far < reach[row]) & hides[
+                row
+            ]  # then any ray in the cell lies in the drop's circle, and so deep at least
             np.minimum.at(best, cell[whole], (far**2 - (1 - 2 * ROUNDING) * reach[row] ** 2)[whole])
 
         def winning() -> Iterator[tuple[Indices, Indices]]:
@@ -123,6 +132,8 @@ class DropGrid:
             d2 = dx * dx + dy * dy
             near = reach[row]
             depth = d2 - near * near
+            if self.bodies:
+                self._correct(depth, row, dx, dy, count[at] > 1)
             near += slope[at] * top[row]
             near *= 1 + ROUNDING
             closer = (depth < best[at]) & (d2 < near * near)
@@ -131,3 +142,11 @@ class DropGrid:
             owner[at] = row[closer]
         numbers: Indices = self.numbers[owner].astype(np.intp)
         return numbers
+
+    def _correct(self, depth: Array, row: Indices, x: Array, y: Array, asked: Mask) -> None:
+        """Depths, (P,), at points x, y of drops in these rows, where they do not fill their circles."""
+        asked = asked & np.isin(row, list(self.bodies))
+        for body in np.unique(row[asked]).tolist():
+            at = np.flatnonzero(asked & (row == body))
+            away = self.bodies[body].beside(x[at], y[at])
+            depth[at] = np.where(away > 0, away * (away + 2 * self.table[2, body]), depth[at])

@@ -74,6 +74,15 @@ class Drop(ABC):
         return False
 
     @property
+    def fills_circle(self) -> bool:
+        """Whether the drop wets all of the circle of its `reach`, nearly; if not, it has `beside`."""
+        return True
+
+    def beside(self, x: Array, y: Array) -> Array:
+        """How far points of the face, (N,), are from what the drop wets: metres, or less; 0 on it."""
+        raise NotImplementedError(f"{type(self).__name__} fills its circle")
+
+    @property
     def steps(self) -> int | None:
         """Parallax steps that stand in for the true intersection of ray and surface; None: no such shortcut."""
         return None

@@ -264,6 +264,19 @@ class HeightMap(Drop):
         j = np.minimum(np.where(inside, u, 0).astype(np.intp), columns - 2)
         return np.asarray(inside & self._wet_cells[i, j] & (self._interpolate(x, y)[0] > 0))
 
+    @property
+    def fills_circle(self) -> bool:
+        """False: bodies of drops that merged are of any shape."""
+        return False
+
+    def beside(self, x: Array, y: Array) -> Array:
+        """How far points of the face are from the wet cells, to a cell; next to nothing in dry parts of these."""
+        rows, columns = self._wet_cells.shape
+        i = np.clip(y / self.spacing + 0.5 * rows, 0, rows - 1).astype(np.intp)
+        j = np.clip(x / self.spacing + 0.5 * columns, 0, columns - 1).astype(np.intp)
+        cells = np.maximum(self._dry[i, j].astype(x.dtype) - 1, 1e-3)
+        return np.where(self.covers(x, y), 0, self.spacing * cells).astype(x.dtype)
+
     @cached_property
     def _wet_cells(self) -> Mask:
         wet = self.heights > 0

@@ -1,7 +1,9 @@
 """Height maps as sums of splines, and rays that meet them in machine code: against scipy, and numpy to the bit."""
 
+from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import RectBivariateSpline
 
 from rainstereo import Camera, Chamber, Panel, compiled, height_map, surface_refraction
+from rainstereo.drop_grid import DropGrid
 from rainstereo.droplet import SphericalCap
 from rainstereo.height_map import HeightMap
 from rainstereo.rain.render import Renderer
@@ -112,6 +115,78 @@ def test_a_plan_lets_go_of_what_rays_needed(way: dict[str, Any]) -> None:
     image = np.random.default_rng(0).integers(0, 256, (60, 80, 3), dtype=np.uint8)
     assert (Renderer(camera, pane, **way).plan(drop).apply(image) != image).any()
     assert "_nodes" not in vars(drop)
+
+
+def crescent() -> HeightMap:
+    """A body around a bay, which its circle holds."""
+    x, y = np.meshgrid(*(np.linspace(-2e-3, 2e-3, 81),) * 2)
+    return HeightMap(
+        (0.0, 0.0), 3e-4 - 900 * (np.hypot(x, y) - 1.2e-3) ** 2 - 1.5e-3 * np.maximum(x - 4e-4, 0) / 4e-4, 5e-5
+    )
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (1.0e-3, 2e-4), (0.2e-3, -1.5e-4)])
+def test_drops_stand_in_the_bays_of_others(place: tuple[float, float]) -> None:
+    """Where only the circles meet, both drops show what they show alone; also in a plan."""
+    camera, pane = Camera.pinhole(1200, 1200, 79.5, 59.5, 160, 120), Chamber((0, 0, 1), 0.05, (Panel(0.003, 1.49),))
+    pixels = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), -1)
+    body, cap = crescent(), SphericalCap(place, 3e-4, 0.7)
+    assert np.hypot(*place) + cap.reach < body.reach
+    both = trace(pixels, [body, cap], camera, pane)
+    for drop in (body, cap):
+        alone = trace(pixels, drop, camera, pane)
+        mine = alone.status == 0
+        assert mine.sum() > 100
+        np.testing.assert_array_equal(both.source[mine], alone.source[mine])
+    other = trace(pixels, [cap, body], camera, pane)
+    np.testing.assert_array_equal(other.source, both.source)
+    image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    renderer = Renderer(camera, pane)
+    found, alone = renderer.plan([body, cap]).apply(image), renderer.plan(cap)
+    inner = cv2.erode((alone.opacity == 1).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert inner.sum() > 50
+    np.testing.assert_array_equal(found[inner], alone.apply(image)[inner])
+
+
+def test_whose_a_ray_is_beside_bodies() -> None:
+    """The drop whose wet part is nearest, in the sense of circles; against all drops one by one."""
+    rng = np.random.default_rng(1)
+    drops = [replace(bumpy(k), centre=tuple(rng.uniform(-3e-3, 3e-3, 2))) for k in range(4)]
+    drops += [SphericalCap(tuple(rng.uniform(-4e-3, 4e-3, 2)), rng.uniform(2e-4, 9e-4), 0.8) for _ in range(30)]
+    x, y = rng.uniform(-6e-3, 6e-3, (2, 4000)).astype(np.float32)
+    slope = np.full(4000, 0.3, dtype=np.float32)
+    found = DropGrid(range(100, 134), drops, np.zeros(3), 0.3).whose(x, y, slope)
+    depth = np.full((len(drops), 4000), np.inf)
+    for row, drop in enumerate(drops):
+        u, v = x - drop.centre[0], y - drop.centre[1]
+        square, most = u * u + v * v, drop.reach + 0.3 * drop.top
+        depth[row] = square - drop.reach**2
+        if isinstance(drop, HeightMap):
+            away = drop.beside(u, v)
+            assert (np.equal(away, 0) == drop.covers(u, v)).all()
+            depth[row] = np.where(away > 0, away * (away + 2 * drop.reach), depth[row])
+        depth[row, square >= most * most] = np.inf
+    nobody, mine = np.isinf(depth).all(0), depth.argmin(0)
+    assert 0.1 < nobody.mean() < 0.9
+    alone = (depth < np.inf).sum(0) < 2  # then nobody asks how far the drop is
+    expected = np.where(nobody, -1, 100 + mine)
+    first, second = np.sort(np.minimum(depth, 1), axis=0)[:2]
+    clear = alone | (second - first > 1e-9)
+    assert clear.mean() > 0.9
+    np.testing.assert_array_equal(found[clear], expected[clear])
+
+
+def test_what_is_beside_a_map_is_no_farther_than_told() -> None:
+    drop = bumpy(11)
+    x, y = places(drop, 12, 2000)
+    wet = np.stack(places(drop, 13, 20_000))[:, drop.covers(*places(drop, 13, 20_000))]
+    away = drop.beside(x, y)
+    nearest = np.hypot(x[:, None] - wet[0], y[:, None] - wet[1]).min(1)
+    dry = ~drop.covers(x, y)
+    assert (away[~dry] == 0).all()
+    assert (away[dry] > 0).all()
+    assert (away <= nearest + 1e-12)[dry].all()
+    assert (away >= nearest - 4 * drop.spacing)[dry].all()
 
 
 @needs_numba
