@@ -63,7 +63,7 @@ class DropOwners:
             for column, cells in self.bodies.items():
                 away = cells.beside(x[0, some, 0] - across[0, 0, column], y[0, some, 0] - down[0, 0, column])
                 beside = (away > 0) & can_meet[0, :, column]
-                outside[0, beside, column] = (away * (away + 2 * reach[0, 0, column]))[beside]
+                outside[0, beside, column] = (away * (away + 2 * reach[0, 0, column])).to(outside)[beside]
             least, owner = outside.min(-1)
             owners[:, some] = torch.where(least < math.inf, numbers.gather(1, owner), NOBODY)
         return owners.reshape(-1)

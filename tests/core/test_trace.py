@@ -377,6 +377,7 @@ def test_tables_of_a_trace_go_with_it() -> None:
     caps = [cap(50), cap(40, "near", centre=(1e-3, 0.0)), cap(60, centre=(2e-3, 0.0))]
     drops = [*caps, HeightMap.of(cap(30, centre=(-3e-3, 0.0)), nodes=17)]
     pixels = np.stack(np.meshgrid(np.linspace(560, 720, 40), np.linspace(450, 510, 30)), -1)
+    trace(pixels, drops, CAMERA, pane())  # which loads what is loaded once
     gc.collect()
     gc.disable()
     try:

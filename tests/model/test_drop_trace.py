@@ -203,6 +203,23 @@ def test_many_drops_equal_numpy(device: torch.device, camera: Camera, face: str,
         agree(t, core.trace(pixels, drops, camera, chamber, 5.0, which=labels), slack, steep=True)
 
 
+@pytest.mark.parametrize("face", ["far", "near"])
+def test_drops_in_the_bay_of_a_body_equal_numpy(device: torch.device, face: str, rng: np.random.Generator) -> None:
+    """A body around a bay, whose circle holds some caps; and one of them alone there shows what it does by itself."""
+    x, y = np.meshgrid(*(np.linspace(-2e-2, 2e-2, 81),) * 2)
+    ring = HeightMap((0.0, 0.0), 3e-3 - 90 * (np.hypot(x, y) - 1.2e-2) ** 2, 5e-4, face=face)
+    inner = [cap(40, face, radius=1.5e-3, centre=(a, -a)) for a in (-3e-3, 0.0, 3e-3)]
+    outer = [cap(40, face, radius=1e-3, centre=(0.021, b)) for b in (-0.01, 0.01)]
+    drops: list[Drop] = [*inner, ring, *outer]
+    found = trace(on(GRID, device), drops, CAMERA, pane(20), 5.0)
+    expected = core.trace(GRID, drops, CAMERA, pane(20), 5.0)
+    assert agree(found, expected, 0.0, steep=True) > 500
+    alone = core.trace(GRID, inner[1], CAMERA, pane(20), 5.0)
+    mine = alone.status == 0
+    assert mine.sum() > 20
+    np.testing.assert_array_equal(expected.source[mine], alone.source[mine])
+
+
 def test_a_lens_of_mrcals(rng: np.random.Generator) -> None:
     mrcal = pytest.importorskip("mrcal", reason="mrcal is not installed")
     model = "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=8_Ny=6_fov_x_deg=80"
