@@ -25,6 +25,7 @@ WATER = 1.333
 INDEX_RANGE = (0.5, 4.5)
 RADIUS_RANGE = (1e-6, 0.1)
 CENTRE_LIMIT = 10.0
+NEXT_TO_NOTHING = 1e-9  # metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +76,12 @@ class Drop(ABC):
 
     @property
     def fills_circle(self) -> bool:
-        """Whether the drop wets all of the circle of its `reach`, nearly; if not, it has `beside`."""
+        """Whether the drop wets all of the circle of its `reach`, nearly."""
         return True
 
     def beside(self, x: Array, y: Array) -> Array:
         """How far points of the face, (N,), are from what the drop wets: metres, or less; 0 on it."""
-        raise NotImplementedError(f"{type(self).__name__} fills its circle")
+        return np.where(self.covers(x, y), 0, NEXT_TO_NOTHING).astype(x.dtype)
 
     @property
     def steps(self) -> int | None:

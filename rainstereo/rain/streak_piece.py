@@ -48,6 +48,11 @@ class StreakPiece(Drop):
         """The streak's."""
         return self.streak.steepest
 
+    @property
+    def fills_circle(self) -> bool:
+        """False: it is as long as wide, but its circle reaches beyond the streak's sides."""
+        return False
+
     def covers(self, x: Array, y: Array) -> Mask:
         """Where points of the face are in the circle and wet."""
         near = x * x + y * y < self.radius**2

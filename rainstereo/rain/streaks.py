@@ -207,6 +207,11 @@ class Streak(Drop):
         """A little more than the height of the highest arc, metres."""
         return 1.001 * float(np.max(self.half_width)) * math.tan(self.contact_angle / 2)
 
+    @property
+    def fills_circle(self) -> bool:
+        """False: it is long."""
+        return False
+
     @cached_property
     def is_convex(self) -> bool:
         """Whether it bends and widens so gently that only rays that graze it lengthwise could meet it more often."""

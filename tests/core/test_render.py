@@ -469,3 +469,23 @@ def test_many_drops_in_bounded_memory(count, way, most):
     added, peak, cover = map(float, done.stdout.split())
     assert cover > 0.3
     assert peak < most, f"{peak:.0f} MB, {added:.0f} of them for the drops"
+
+
+BODIES = """
+from rainstereo.rain.pane import Pane
+from rainstereo.rain.population import Population
+from rainstereo.rain.sequence import joined_shapes
+pane = Pane.seen(camera, Chamber((0, 0, 1), 0.057, (Panel(0.003, 1.49),)))
+drops = joined_shapes(Population.preset("drops").with_cover(0.1).sample(0, pane))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory is read from Linux's /proc")
+def test_bodies_in_bounded_memory():
+    """195 drops, of which most merged: tables of each cell's polynomial would take twice as much."""
+    told = MEMORY.replace("WAY", "").replace("COUNT", "1").replace("base = most()", f"{BODIES}base = most()")
+    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True, timeout=600)
+    added, peak, cover = map(float, done.stdout.split())
+    assert cover > 0.08
+    assert peak < 400, f"{peak:.0f} MB, {added:.0f} of them for the drops"

@@ -232,15 +232,21 @@ def test_pieces_are_the_streak(face: str) -> None:
     np.testing.assert_allclose(parts.source[seen], whole.source[seen], rtol=0, atol=1e-8)
 
 
-def test_pieces_leave_drops_beside_a_streak_alone() -> None:
-    """A whole streak's circle would take the pixels of a drop beside it; those of its pieces do not."""
-    streak, drop = winding(30), SphericalCap((0.004, -0.002), 1e-3, 0.8)
+@pytest.mark.parametrize(
+    ("whole", "place", "radius"), [(False, 4e-3, 1e-3), (False, 2.2e-3, 3e-4), (True, 4e-3, 1e-3), (True, 2.2e-3, 3e-4)]
+)
+def test_a_streak_leaves_drops_beside_it_alone(whole: bool, place: float, radius: float) -> None:
+    """Its circle, and some of its pieces', hold them."""
+    streak, drop = winding(30), SphericalCap((place, -0.002), radius, 0.8)
+    parts = [streak] if whole else streak.pieces()
+    circles = [np.hypot(p.centre[0] - place, p.centre[1] + 0.002) < p.reach for p in parts]
+    assert any(circles) == (whole or radius < 1e-3)
     rows, columns = window(drop, CAMERA, pane())
     pixels = np.stack(np.meshgrid(np.arange(columns.start, columns.stop), np.arange(rows.start, rows.stop)), -1)
     alone = trace(pixels.astype(float), drop, CAMERA, pane(), 5.0)
-    beside = trace(pixels.astype(float), [*streak.pieces(), drop], CAMERA, pane(), 5.0)
+    beside = trace(pixels.astype(float), [*parts, drop], CAMERA, pane(), 5.0)
     seen = alone.status == Fate.THROUGH
-    assert seen.sum() > 300
+    assert seen.sum() > 1e8 * radius**2
     np.testing.assert_array_equal(beside.status[seen], Fate.THROUGH)
     np.testing.assert_allclose(beside.source[seen], alone.source[seen], rtol=0, atol=1e-9)
 
