@@ -65,8 +65,11 @@ def compile_here(way: Way) -> None:
     cap = SphericalCap((0, 0), 0.001, 0.5)
     _meet_bodies()
     if way == "moving":
+        from rainstereo.compiled.cap_rivals import meet
+
         from .render import Renderer  # which needs this module
 
+        meet(np.zeros((1, 3)), 0, 1, (SIDE, SIDE), np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.uint32))
         Renderer(camera, pane, moving=True).plan(cap).render(np.zeros((SIDE, SIDE, 3), dtype=np.uint8))
         give_back()
         return
