@@ -11,6 +11,8 @@ import numpy as np
 
 from rainstereo.types import Array, Indices
 
+from .free_memory import give_back
+
 FEW = 1500  # caps, up to which all pairs are compared
 MOST = 1 << 22  # rivals in a list, 4 bytes each; but a cap's are in one list, however many
 TOGETHER = 1 << 16  # caps whose rivals are looked for at a time
@@ -44,6 +46,7 @@ class Rivals:
         np.cumsum(starts, out=starts)
         found = cls(circles, size, starts, _cuts(starts))
         if len(found.cuts) > 2:
+            give_back()  # before frames take memory
             return found
         _, _, whole, _ = next(found.blocks)
         return replace(found, whole=whole)

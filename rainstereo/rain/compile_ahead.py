@@ -29,7 +29,7 @@ from .pursuit import Pursuit
 from .quadtree import Quadtree, Taps
 
 Way = Literal["default", "lasting", "moving"]
-MANY = 1 << 17  # pixels of a plan, or of moving drops, whose loops are compiled before tables take memory
+MANY = 1 << 17  # pixels of a plan, or of moving drops, or such drops: loops are compiled before tables take memory
 SIDE = 8  # pixels
 SPAN = 40  # of the rays of a pixel
 PATIENCE = 600.0  # seconds for another process; then this one compiles

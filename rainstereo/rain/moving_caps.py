@@ -204,6 +204,10 @@ class CapTable:
     ) -> CapTable:  # fmt: skip
         from rainstereo.compiled.cap_outlines import outline
 
+        from .compile_ahead import MANY, compile_ahead  # which needs `render`
+
+        if len(x) > MANY:
+            compile_ahead("moving")
         _check_places(scene, caps, x, y, radius, angle)
         limits = MARGIN, FAR
         return cls(
