@@ -39,7 +39,6 @@ from .cap_tiles import (
     FAR,
     LITS,
     OUT_RADIUS,
-    OUT_RIVALS,
     PARTLY,
     SIZE,
     TILE,
@@ -62,29 +61,30 @@ NONE, ONE_LANE = np.uint64(0), np.uint64(1)
 @fused
 def frame(
     mode: Any, out: Any, size: Any, scene: Any, words: Any, boxes: Any, border: Any, shift: Any, bands: Any,
-    nodes: Any, caps: Any, outlines: Any, rivals: Any, later: Any, view: Any,
+    nodes: Any, caps: Any, outlines: Any, span: Any, rivals: Any, rival_starts: Any, later: Any, view: Any,
     record: Any, desk: Any,
 ) -> None:  # fmt: skip
-    """Go over the pixels of caps, in the order of the caps.
+    """Go over the pixels of some caps, in the order of the caps.
 
     mode: DRAW: into `out`, (H W C,) of up to three channels of bytes, which holds the clear image, from boxes of the
     scene in `words`. COUNT: how many pixels and taps there are, to record's counters. FILL: write them to record, taps
     only if it has room for any.
     scene: (h, w, C) bytes; only its size matters unless drawing. boxes: starts, widths, inverse distances (`boxes`).
     border, shift: how the scene goes on, and where the frame is in it. bands: of patches' areas (`cap_tiles`).
-    nodes, caps, ...: see `cap_rays`, `cap_tiles`.
+    nodes, caps, ...: see `cap_rays`, `cap_tiles`. span: first number of those to go over, and that after the last.
+    rivals, rival_starts: the numbers of all caps that meet those, and where each cap's start, see `cap_rivals`.
     record: pixels, caps' numbers, taps a pixel, clear shares, displacements, unknown; texels, weights; counters.
     """
     starts, pitches, inverses = boxes
     width, height = size
     last = np.float32(scene.shape[1] - 1), np.float32(scene.shape[0] - 1)
     rays, line, tile, slopes, total, at, beams, pixels, hidden, places, parts, light = desk
-    for number in range(len(caps)):
+    for number in range(span[0], span[1]):
         cap, outline = caps[number], outlines[number]
         if not outline[OUT_RADIUS] > 0:
             continue
         left, right, top, bottom = bounds(outline, width, height)
-        made = 0
+        some_rivals, made = (rival_starts[number - span[0]], rival_starts[number - span[0] + 1]), 0
         for v1 in range(top, bottom, TILE):
             v2 = min(v1 + TILE, bottom)
             for u1 in range(left, right, TILE):
@@ -115,8 +115,8 @@ def frame(
                     known = low < high
                     patches(rays, begin, end, bands, len(starts), shift, last)
                     shares_of_row(tile, t, s, lanes, low, high, edge, wide, hangs, cap, line, rays)
-                    if outline[OUT_RIVALS] > 0:
-                        taken(tile, t, s, u1, v, lanes, wide, caps, number, rivals, outlines, line, rays)
+                    if some_rivals[0] < some_rivals[1]:
+                        taken(tile, t, s, u1, v, lanes, wide, caps, number, rivals, some_rivals, outlines, line, rays)
                     share_out(rays, begin, end)
                     if mode != DRAW:
                         slopes_of_row(tile, t, slopes)

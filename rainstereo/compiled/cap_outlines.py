@@ -1,4 +1,4 @@
-"""Tables of caps on a panel's far face: where the image shows them (as `rain.outlines`), and which meet."""
+"""Tables of caps on a panel's far face: where the image shows them (as `rain.outlines`), and as loops take them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from .cap_rays import (
     VIEW_FOLD,
     VIEW_LENS,
 )
-from .cap_tiles import OUT_RIVAL, OUT_RIVALS
 from .compile import compiled, inlined
 
 ITERATIONS = 100
@@ -113,37 +112,12 @@ def _comes_before(caps: Any, one: Any, other: Any) -> Any:
 
 
 @compiled
-def meeting(circles: Any) -> Any:
-    """How many other circles meet each, (N,), and their numbers, in the order of the circles that they meet, and of
-    their own."""
-    x, y, radius = circles[:, 0].copy(), circles[:, 1].copy(), circles[:, 2].copy()
-    counts = np.empty(len(x), np.int64)
-    for i in range(len(x)):
-        found = -1
-        for j in range(len(x)):
-            dx, dy, reach = x[i] - x[j], y[i] - y[j], radius[i] + radius[j]
-            found += dx * dx + dy * dy < reach * reach
-        counts[i] = found
-    rivals, at = np.empty(counts.sum(), np.int64), np.uint64(0)
-    for i in range(np.uint64(len(x))):
-        other, stop = np.uint64(0), at + np.uint64(counts[i])
-        while at < stop:
-            dx, dy, reach = x[i] - x[other], y[i] - y[other], radius[i] + radius[other]
-            if dx * dx + dy * dy < reach * reach and i != other:
-                rivals[at] = other
-                at += np.uint64(1)
-            other += np.uint64(1)
-    return counts, rivals
+def tabulated(caps: Any, origin: Any) -> Any:
+    """Caps as `cap_rays` takes them, (N, 7), and their indices, (I,).
 
-
-@compiled
-def tabulated(caps: Any, circles: Any, counts: Any, origin: Any) -> Any:
-    """Caps as `cap_rays` takes them, (N, 7), outlines as `cap_tiles` does, (N, 5), and the caps' indices, (I,).
-
-    counts: (N,) of each cap's rivals. origin: of the face's coordinates. The caps are `ordered`.
+    origin: of the face's coordinates. The caps are `ordered`.
     """
-    columns, outlines, indices = np.empty((len(caps), 7)), np.empty((len(caps), 5)), np.empty(len(caps))
-    kinds, first = 0, 0
+    columns, indices, kinds = np.empty((len(caps), 7)), np.empty(len(caps)), 0
     for i in range(len(caps)):
         radius, angle, index = caps[i, 2], caps[i, 3], caps[i, 4]
         if i == 0 or index != caps[i - 1, 4]:
@@ -153,11 +127,7 @@ def tabulated(caps: Any, circles: Any, counts: Any, origin: Any) -> Any:
         columns[i, CAP_SQUARE], columns[i, CAP_DEPTH] = radius * radius, radius / math.tan(angle)
         columns[i, CAP_CURVATURE] = math.sin(angle) / radius
         columns[i, CAP_INDEX], columns[i, CAP_DIM] = index, kinds - 1
-        for k in range(3):
-            outlines[i, k] = circles[i, k]
-        outlines[i, OUT_RIVAL], outlines[i, OUT_RIVALS] = first, counts[i]
-        first += counts[i]
-    return columns, outlines, indices[:kinds]
+    return columns, indices[:kinds]
 
 
 @inlined

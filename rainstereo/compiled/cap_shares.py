@@ -33,7 +33,7 @@ from .cap_rays import (
     of_row,
     take_up,
 )
-from .cap_tiles import OUT_RADIUS, OUT_RIVAL, OUT_RIVALS, OUT_X, OUT_Y, along, down, value_on
+from .cap_tiles import OUT_RADIUS, OUT_X, OUT_Y, along, down, value_on
 from .cap_vectors import EIGHT, above, above_zero, ends, lanes_from, lowest
 from .compile import fused, fused_part
 
@@ -42,6 +42,7 @@ SAGITTA = np.float32(1.1 / 24)
 pixel are somewhat longer than its side."""
 FAR_LESS = np.float32(1e9)  # room: none at all
 FEW = 24  # lanes all of whose shares are computed
+LOOK = np.uint64(7)  # before every eighth rival it is looked whether those so far have left a cap anything
 ALIKE = 1e-6  # of a cap's room: less of a difference is rounding
 
 
@@ -180,17 +181,19 @@ def _by_sides(tile: Any, t: Any, s: Any, lanes: Any, edge: Any, wide: Any, cap: 
 @fused
 def taken(
     tile: Any, t: Any, s: Any, u: Any, v: Any, lanes: Any, wide: Any, caps: Any, number: Any, rivals: Any,
-    outlines: Any, line: Any, rays: Any,
+    some: Any, outlines: Any, line: Any, rays: Any,
 ) -> None:  # fmt: skip
     """Give up the pixels of a row where another cap, that may hide some of them, has more room; and note in `RIVAL`
     which may have more in a part of those that are kept. u, v: column of lane 0, and row; others' outlines say which
-    lanes may be theirs.
+    lanes may be theirs. some: where in `rivals` the cap's start, and the end of the last.
 
     As in `drop_grid`, room is counted from the circle that a cap covers seen along the normal: its sphere's, if it
     hangs over.
     """
-    first, known = int(outlines[number, OUT_RIVAL]), False
-    for i in range(first, first + int(outlines[number, OUT_RIVALS])):
+    first, known = np.uint64(some[0]), False
+    for i in range(first, np.uint64(some[1])):
+        if (i - first) & LOOK == LOOK and not above_zero(rays, HIDDEN):
+            return  # nothing is left
         other = rivals[i]
         radius, far = outlines[other, OUT_RADIUS], v - outlines[other, OUT_Y]
         square_half = radius * radius - far * far

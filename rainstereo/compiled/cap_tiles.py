@@ -42,8 +42,8 @@ NEARLY = np.float32(1e-5)  # of the square of an index: what rounding may hide
 TILE = 56  # pixels along a side, at most
 TINY = 2.5
 """Contact radius, pixels, below which all pixels of a cap have many rays of their own."""
-OUT_X, OUT_Y, OUT_RADIUS, OUT_RIVAL, OUT_RIVALS = range(5)
-"""Columns of a table of outlines, float64: a circle in the image, and which of the list of rivals are the cap's."""
+OUT_X, OUT_Y, OUT_RADIUS = range(3)
+"""Columns of a table of outlines, float64: circles in the image."""
 WHOLE, PARTLY = np.float32(2), np.float32(1)
 """Of a pixel's rays beside it, whether all or only some are lit."""
 CX, CY, AX, AY, BX, BY, AXX, AYY, BXX, BYY, ABX, ABY, GAINS, SIZE, ACROSS, DOWN, FAR, LITS = (

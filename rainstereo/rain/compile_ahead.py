@@ -29,7 +29,7 @@ from .pursuit import Pursuit
 from .quadtree import Quadtree, Taps
 
 Way = Literal["default", "lasting", "moving"]
-MANY = 1 << 17  # pixels of a plan, or of moving drops, whose loops are compiled before tables take memory
+MANY = 1 << 17  # pixels of a plan, or of moving drops, or such drops: loops are compiled before tables take memory
 SIDE = 8  # pixels
 SPAN = 40  # of the rays of a pixel
 PATIENCE = 600.0  # seconds for another process; then this one compiles
@@ -65,8 +65,11 @@ def compile_here(way: Way) -> None:
     cap = SphericalCap((0, 0), 0.001, 0.5)
     _meet_bodies()
     if way == "moving":
+        from rainstereo.compiled.cap_rivals import meet
+
         from .render import Renderer  # which needs this module
 
+        meet(np.zeros((1, 3)), 0, 1, (SIDE, SIDE), np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.uint32))
         Renderer(camera, pane, moving=True).plan(cap).render(np.zeros((SIDE, SIDE, 3), dtype=np.uint8))
         give_back()
         return

@@ -27,7 +27,7 @@ from rainstereo.refraction import backproject
 from rainstereo.types import Array, Image, Indices, Mask
 
 from .boxes import Boxes
-from .contacts import touching
+from .cap_rivals import Rivals
 from .drops import Drops
 from .outlines import BETWEEN, MARGIN, RING
 
@@ -38,7 +38,6 @@ FINE = (25.0, 9), (math.inf, 12)
 COARSE = (36.0, 4), (math.inf, 6)
 """Square root of the area, pixels, up to which what a pixel shows gets how many looks."""
 COARSE_FROM = 2.5  # gray levels that a renderer allows
-FEW = 1500  # caps, up to which all pairs are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +158,12 @@ class CapScene:
         border = 0 if self.border == "mirror" else 1
         shift = np.float32(self.shift[0]), np.float32(self.shift[1])
         flat, sizes = out.reshape(-1), (boxes.start, boxes.width, boxes.inverse)
-        frame(
-            mode, flat, self.camera.size, scene, words, sizes, border, shift, self.bands, caps.nodes, caps.columns,
-            caps.outlines, caps.rivals, lattice.later, lattice.view, record, desk(),
-        )  # fmt: skip
+        room = desk()
+        for first, last, rivals, starts in caps.rivals.blocks:
+            frame(
+                mode, flat, self.camera.size, scene, words, sizes, border, shift, self.bands, caps.nodes, caps.columns,
+                caps.circles, (first, last), rivals, starts, lattice.later, lattice.view, record, room,
+            )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +204,10 @@ class CapTable:
     ) -> CapTable:  # fmt: skip
         from rainstereo.compiled.cap_outlines import outline
 
+        from .compile_ahead import MANY, compile_ahead  # which needs `render`
+
+        if len(x) > MANY:
+            compile_ahead("moving")
         _check_places(scene, caps, x, y, radius, angle)
         limits = MARGIN, FAR
         return cls(
@@ -238,43 +243,21 @@ class CapTable:
         return self._made[0]
 
     @property
-    def outlines(self) -> Array:
-        """(N, 5), see `compiled.cap_tiles`: circles, and the part of `rivals` that is each cap's."""
-        return self._made[1]
-
-    @property
     def nodes(self) -> Array:
         """The lattice, and how drops of each index dim."""
-        return self.scene.nodes(tuple(self._made[2].tolist()))
-
-    @property
-    def rivals(self) -> Indices:
-        """Numbers of caps whose circles meet each cap's."""
-        return self._rivals[1]
+        return self.scene.nodes(tuple(self._made[1].tolist()))
 
     @cached_property
-    def _made(self) -> tuple[Array, Array, Array]:
+    def rivals(self) -> Rivals:
+        """Caps whose circles meet each cap's."""
+        return Rivals.of(self.circles, self.scene.camera.size)
+
+    @cached_property
+    def _made(self) -> tuple[Array, Array]:
         from rainstereo.compiled.cap_outlines import tabulated
 
-        made: tuple[Array, Array, Array] = tabulated(
-            self.caps, self.circles, self._rivals[0], self.scene.lattice.origin
-        )
+        made: tuple[Array, Array] = tabulated(self.caps, self.scene.lattice.origin)
         return made
-
-    @cached_property
-    def _rivals(self) -> tuple[Indices, Indices]:
-        """How many they are, (N,), and their numbers, cap by cap."""
-        from rainstereo.compiled.cap_outlines import meeting
-
-        if len(self.caps) <= FEW:
-            found: tuple[Indices, Indices] = meeting(self.circles)
-            return found
-        one, other = touching(*np.ascontiguousarray(self.circles.T))
-        count = len(self.caps)
-        pairs = np.concatenate([one * count + other, other * count + one])
-        del one, other  # much memory, of drops that hide one another
-        pairs.sort()
-        return np.bincount(pairs // count, minlength=count), pairs % count
 
     # -- drawn ---------------------------------------------------------------------------------------------------------
 

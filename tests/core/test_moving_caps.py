@@ -179,7 +179,7 @@ class OwnRays:
         self.table = CapTable.of(scene_of(CAMERA, PANE, math.inf), [drop], np.zeros(1, np.intp))
         self.tile, self.rays = np.zeros((3, POLYNOMIALS), np.float32), np.zeros(PLANES * 64, np.float32)
         self.beams, self.noted, *_ = room_for_light()
-        self.outline = self.table.outlines[0]
+        self.outline = self.table.circles[0]
         self.middle = round(float(self.outline[0])), round(float(self.outline[1]))
         self.origin = fit(self.table.nodes, self.table.columns[0], *self.middle, 20, self.tile)
 
@@ -195,7 +195,7 @@ class OwnRays:
         slopes_of_row(self.tile, t, slopes)
         form, table = form_of(u, v, self.outline, False, -1), self.table
         hidden = set_out(
-            s, u, v, True, form, 0, table.columns, 0, -1, table.outlines, line, slopes, self.rays, np.uint64(0)
+            s, u, v, True, form, 0, table.columns, 0, -1, table.circles, line, slopes, self.rays, np.uint64(0)
         )  # fmt: skip
         lattice, planes = table.scene.lattice, self.rays.reshape(-1, 64)
         trace_own(table.columns[0], lattice.later, lattice.view, self.rays, RAYS)

@@ -459,6 +459,7 @@ print((peak - base) / 1024, peak / 1024, found.drop_mask.mean())
         (10_000, "lasting=False", 430),
         (10_000, "lasting=True", 500),
         (10_000, "moving=True", 400),
+        (300_000, "moving=True", 500),
         (1_000_000, "lasting=None", 500),
     ],
 )

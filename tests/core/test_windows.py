@@ -177,17 +177,22 @@ def test_loops_compiled_ahead_are_those_that_draw(lasting, monkeypatch):
 
 
 @needs_numba
-def test_loops_compiled_ahead_are_those_that_draw_moving_drops():
-    from rainstereo.compiled import boxes, cap_frames, cap_outlines
+def test_loops_compiled_ahead_are_those_that_draw_moving_drops(monkeypatch):
+    from rainstereo.compiled import boxes, cap_frames, cap_outlines, cap_rivals
+    from rainstereo.rain import cap_rivals as rivals
 
-    loops = [cap_frames.frame, cap_outlines.outline, cap_outlines.tabulated, boxes.every_box]
+    loops = [cap_frames.frame, cap_outlines.outline, cap_outlines.tabulated, cap_rivals.meeting, cap_rivals.meet]
+    loops += [boxes.every_box]
     compile_ahead.cache_clear()
     compile_ahead("moving")
     before = [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
+    assert all(before)
     lens = np.array([400, 400, 101, 75, 0.1, -0.02, 0.001, 0.002])
     for camera in (Camera.pinhole(400, 400, 101, 75, *SIZE), Camera("LENSMODEL_OPENCV4", lens, *SIZE)):
-        plan = Renderer(camera, PANE, moving=True, border="edge").plan([SphericalCap((0.0, 0.0), 1e-3, 0.9)])
-        plan.render(np.zeros((*SIZE[::-1], 3), dtype=np.uint8))
+        for few in (0, 1):
+            monkeypatch.setattr(rivals, "FEW", few)
+            plan = Renderer(camera, PANE, moving=True, border="edge").plan([SphericalCap((0.0, 0.0), 1e-3, 0.9)])
+            plan.render(np.zeros((*SIZE[::-1], 3), dtype=np.uint8))
     assert [len(loop.signatures) for loop in loops] == before  # type: ignore[attr-defined]
 
 
