@@ -36,12 +36,11 @@ class HeightCells:
 
     def level(self, x: Tensor, y: Tensor, z: Tensor | float) -> Tensor:
         """Height of the surface, continued below the face, minus z: metres, positive in the water."""
-        return self._interpolate(x, y)[0] - z
+        return self.slopes(x, y)[0] - z
 
     def covers(self, x: Tensor, y: Tensor) -> Tensor:
         """Where points of the face, (N,) each, are wetted."""
-        height, _, _, cell, inside = self._interpolate(x, y)
-        return inside & (self.dry[cell] == 0) & (height > 0)
+        return self.slopes(x, y)[0] > 0
 
     def beside(self, x: Tensor, y: Tensor) -> Tensor:
         """`HeightMap.beside`."""
@@ -52,11 +51,7 @@ class HeightCells:
         return torch.where(self.covers(x, y), 0.0, away)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Height and its derivatives along x and y, (N,) each."""
-        return self._interpolate(x, y)[:3]
-
-    def _interpolate(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Height and slopes, see `HeightMap._interpolate`; the cell, and whether it is inside."""
+        """Height and its derivatives along x and y, (N,) each, see `HeightMap._interpolate`."""
         rows, columns = self.drop.heights.shape
         u, v = x / self.drop.spacing + (columns - 1) / 2, y / self.drop.spacing + (rows - 1) / 2
         inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
@@ -75,7 +70,7 @@ class HeightCells:
         along_u = t0 + v * (t1 + v * (t2 + v * t3))
         height = torch.where(self.dry[cell] == 0, height, height.clamp(max=0))
         height, sx, sy = (torch.where(inside, a, 0.0) for a in (height * self.drop.spacing, along_u, along_v))
-        return height, sx, sy, cell, inside
+        return height, sx, sy
 
 
 @dataclass(frozen=True, eq=False)

@@ -256,13 +256,7 @@ class HeightMap(Drop):
 
     def covers(self, x: Array, y: Array) -> Mask:
         """Where the interpolated height is above 0, and so is that of a neighbouring node."""
-        rows, columns = self.heights.shape
-        with np.errstate(invalid="ignore"):
-            v, u = y / self.spacing + (rows - 1) / 2, x / self.spacing + (columns - 1) / 2
-            inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
-        i = np.minimum(np.where(inside, v, 0).astype(np.intp), rows - 2)
-        j = np.minimum(np.where(inside, u, 0).astype(np.intp), columns - 2)
-        return np.asarray(inside & self._wet_cells[i, j] & (self._interpolate(x, y)[0] > 0))
+        return np.asarray(self._interpolate(x, y)[0] > 0)
 
     @property
     def fills_circle(self) -> bool:
@@ -304,8 +298,8 @@ class HeightMap(Drop):
 
     def surface(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Height and slopes over the face, (N,) each, metres; all 0 where it is dry."""
-        wet = self.covers(x, y)
         height, sx, sy = self._interpolate(x, y)
+        wet = height > 0
         return np.where(wet, height, 0), np.where(wet, sx, 0), np.where(wet, sy, 0)
 
 

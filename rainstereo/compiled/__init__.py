@@ -11,6 +11,7 @@ from functools import cache
 from importlib import import_module
 
 MANY = 64
+"""Numbers from which on a loop is worth loading numba."""
 
 
 @cache

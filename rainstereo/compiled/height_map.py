@@ -13,7 +13,7 @@ import numpy as np
 from .compile import compiled, inlined
 
 U = np.uint64
-STEPS = 12
+STEPS = 12  # along a ray, until it has passed by all water or must be looked at closely
 
 
 @compiled
